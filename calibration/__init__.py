@@ -1,0 +1,1 @@
+"""From magnetic vectors to whisker angles, and how that is fitted."""

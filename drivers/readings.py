@@ -1,0 +1,96 @@
+"""What a decoder yields: contents in SI units, still in the device's own time.
+
+The clock (`clock.py`) and the device (`device.py`) turn readings into measurements with host time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, TypeAlias
+
+from drivers.counters import Counters
+from drivers.measurement import BoolArray, FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class HallReading:
+    """Field of the whole array, shape (rows, cols, 3), mT, with validity and the time between sensors."""
+
+    device_time_us: int | None
+    sequence: int | None
+    field_mT: FloatArray
+    valid: BoolArray
+    sensor_period_us: int
+
+
+@dataclass(frozen=True, slots=True)
+class ImuReading:
+    """Angular rate (rad/s) and specific force (m/s2), shape (3,) each; orientation where the device has it."""
+
+    device_time_us: int | None
+    sequence: int | None
+    gyro: FloatArray | None
+    acceleration: FloatArray | None
+    orientation_xyzw: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class EncoderReading:
+    """Cumulative ticks of the screws as sent: they wrap modulo 2^32."""
+
+    device_time_us: int | None
+    sequence: int | None
+    ticks: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class MotorReading:
+    """Speeds (rad/s), currents (mA) and voltages (V) of the screws, shape (4,), NaN where nothing is said."""
+
+    device_time_us: int | None
+    sequence: int | None
+    speed: FloatArray
+    current_mA: FloatArray
+    voltage_V: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryReading:
+    """Body velocity vx, vy (m/s), wz (rad/s), shape (3,), mean over the interval that ends at the time."""
+
+    device_time_us: int | None
+    sequence: int | None
+    velocity: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class HelloReading:
+    """The firmware's name and version."""
+
+    device_time_us: int | None
+    sequence: int | None
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class PongReading:
+    """The answer to a PING; the device time is the device's clock when it answered."""
+
+    device_time_us: int
+    sequence: int | None
+    nonce: int
+
+
+Reading: TypeAlias = (
+    HallReading | ImuReading | EncoderReading | MotorReading | OdometryReading | HelloReading | PongReading
+)
+
+
+class Decoder(Protocol):
+    """Sans-IO: bytes in any fragmentation in, readings out; never raises on what comes from the line."""
+
+    counters: Counters
+
+    def feed(self, data: bytes) -> list[Reading]:
+        """Take some bytes; return the readings that they complete."""
+        ...
