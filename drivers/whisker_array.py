@@ -1,0 +1,181 @@
+"""`robominer_msgs/msg/WhiskerArray` packed and unpacked in one go, and what it means as a HallFrame.
+
+64 whiskers are 128 nested objects for a general decoder, 25 times a second. In CDR a `Whisker` always takes 24
+bytes at a 4-byte boundary, so the whole sequence is one numpy record array.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.counters import Counters
+from drivers.measurement import HallFrame
+from drivers.ros_messages import (
+    CDR_LITTLE_ENDIAN,
+    NANOSECONDS_PER_SECOND,
+    MessageError,
+    deserialize,
+    time_to_ns,
+)
+
+TYPENAME = "robominer_msgs/msg/WhiskerArray"
+REPRESENTATIONS = ("Cartesian", "Spherical")
+#: Offset of odd rows against even ones, in columns, as the RM3 firmware fills it in; nothing here reads it.
+ODD_ROW_OFFSET = -0.5
+
+#: One `Whisker` as CDR lays it out; the bytes between the fields are padding.
+WHISKER = np.dtype(
+    {
+        "names": ["row_num", "col_num", "offset_y", "has_error", "x", "y", "z"],
+        "formats": ["u1", "u1", "<f4", "u1", "<f4", "<f4", "<f4"],
+        "offsets": [0, 1, 4, 8, 12, 16, 20],
+        "itemsize": 24,
+    }
+)
+_STAMP = struct.Struct("<iI")
+_UINT32 = struct.Struct("<I")
+
+
+@dataclass(frozen=True, slots=True)
+class WhiskerArray:
+    """The message's content; `whiskers` has dtype `WHISKER`, one record a whisker, in the message's order."""
+
+    stamp_ns: int
+    frame_id: str
+    num_mux: int
+    num_sensors: int
+    representation: str
+    whiskers: NDArray[np.void]
+
+
+def _align4(size: int) -> int:
+    return (size + 3) & ~3
+
+
+def encode(message: WhiskerArray) -> bytes:
+    """The message as little-endian CDR, byte for byte as a general serialiser writes it."""
+    sec, nanosec = divmod(message.stamp_ns, NANOSECONDS_PER_SECOND)
+    body = bytearray(_STAMP.pack(sec, nanosec))
+    _append_string(body, message.frame_id)
+    body += bytes((message.num_mux, message.num_sensors))
+    _append_string(body, message.representation)
+    body += bytes(_align4(len(body)) - len(body)) + _UINT32.pack(len(message.whiskers))
+    # A fresh zeroed array, so that padding never carries what was in memory before.
+    records = np.zeros(len(message.whiskers), dtype=WHISKER)
+    for name in WHISKER.names or ():
+        records[name] = message.whiskers[name]
+    return CDR_LITTLE_ENDIAN + bytes(body) + records.tobytes()
+
+
+def _append_string(body: bytearray, text: str) -> None:
+    encoded = text.encode() + b"\0"
+    body += bytes(_align4(len(body)) - len(body)) + _UINT32.pack(len(encoded)) + encoded
+
+
+def decode(data: bytes) -> WhiskerArray:
+    """The message from CDR of either byte order.
+
+    Raises:
+        MessageError: the bytes are not one whole WhiskerArray.
+    """
+    if data[:2] != CDR_LITTLE_ENDIAN[:2]:
+        return _decode_general(data)
+    body = memoryview(data)[4:]
+    try:
+        sec, nanosec = _STAMP.unpack_from(body)
+        frame_id, at = _read_string(body, _STAMP.size)
+        num_mux, num_sensors = body[at], body[at + 1]
+        representation, at = _read_string(body, at + 2)
+        at = _align4(at)
+        (count,) = _UINT32.unpack_from(body, at)
+    except (struct.error, IndexError, UnicodeDecodeError) as error:
+        raise MessageError(f"not a message of type {TYPENAME}: {error}") from error
+    at += _UINT32.size
+    surplus = len(body) - at - count * WHISKER.itemsize
+    if not 0 <= surplus <= 3:
+        raise MessageError(f"not a message of type {TYPENAME}: {count} whiskers do not fit {len(data)} bytes")
+    whiskers = np.frombuffer(body, dtype=WHISKER, count=count, offset=at) if count else np.zeros(0, WHISKER)
+    stamp_ns = sec * NANOSECONDS_PER_SECOND + nanosec
+    return WhiskerArray(stamp_ns, frame_id, num_mux, num_sensors, representation, whiskers)
+
+
+def _read_string(body: memoryview, at: int) -> tuple[str, int]:
+    at = _align4(at)
+    (length,) = _UINT32.unpack_from(body, at)
+    end = at + _UINT32.size + length
+    if length == 0 or end > len(body):
+        raise IndexError(f"a string of {length} bytes at {at}")
+    return bytes(body[at + _UINT32.size : end - 1]).decode(), end
+
+
+def _decode_general(data: bytes) -> WhiskerArray:
+    message = deserialize(data, TYPENAME)
+    whiskers = np.zeros(len(message.whiskers), dtype=WHISKER)
+    for record, whisker in zip(whiskers, message.whiskers, strict=True):
+        position = whisker.pos
+        record["row_num"], record["col_num"] = position.row_num, position.col_num
+        record["offset_y"] = position.offset_y
+        record["has_error"] = whisker.has_error
+        record["x"], record["y"], record["z"] = whisker.x, whisker.y, whisker.z
+    return WhiskerArray(
+        time_to_ns(message.header.stamp),
+        message.header.frame_id,
+        message.num_mux,
+        message.num_sensors,
+        message.representation,
+        whiskers,
+    )
+
+
+def encode_frame(frame: HallFrame, frame_id: str = "") -> bytes:
+    """A HallFrame as CDR; `sensor_period_ns` has no place in the message.
+
+    Raises:
+        MessageError: more rows or columns than the message can name.
+    """
+    rows, cols = frame.valid.shape
+    if rows > 255 or cols > 255:
+        raise MessageError(f"an array of {rows} x {cols} whiskers does not fit a WhiskerArray (255 x 255)")
+    records = np.zeros(rows * cols, dtype=WHISKER)
+    row, col = np.divmod(np.arange(rows * cols), cols)
+    records["row_num"], records["col_num"] = row, col
+    records["offset_y"] = np.where(row % 2 == 1, ODD_ROW_OFFSET, 0.0)
+    records["has_error"] = ~frame.valid.ravel()
+    field_mT = np.where(frame.valid[..., None], frame.field_mT, 0.0).reshape(-1, 3)
+    records["x"], records["y"], records["z"] = field_mT.T
+    return encode(WhiskerArray(frame.stamp_ns, frame_id, rows, cols, frame.representation, records))
+
+
+def decode_frame(data: bytes, counters: Counters, sensor_period_ns: int = 0) -> HallFrame:
+    """The HallFrame in a message; whiskers that it leaves out are invalid.
+
+    Args:
+        data: CDR bytes.
+        counters: `not_finite` counts whiskers whose field is not finite; they become invalid.
+        sensor_period_ns: goes into the frame.
+
+    Raises:
+        MessageError: the bytes are not one whole WhiskerArray, or its content contradicts itself.
+    """
+    message = decode(data)
+    if message.representation not in REPRESENTATIONS:
+        raise MessageError(f"representation {message.representation!r}, expected one of {REPRESENTATIONS}")
+    rows, cols = message.num_mux, message.num_sensors
+    whiskers = message.whiskers
+    row, col = whiskers["row_num"], whiskers["col_num"]
+    if rows * cols == 0 or (row >= rows).any() or (col >= cols).any():
+        raise MessageError(f"a whisker outside the array of {rows} x {cols}")
+    values = np.stack([whiskers["x"], whiskers["y"], whiskers["z"]], axis=1).astype(np.float64)
+    usable = whiskers["has_error"] == 0
+    finite = np.isfinite(values).all(axis=1)
+    counters["not_finite"] += int(np.count_nonzero(usable & ~finite))
+    usable &= finite
+    field_mT = np.zeros((rows, cols, 3))
+    valid = np.zeros((rows, cols), dtype=np.bool_)
+    valid[row[usable], col[usable]] = True
+    field_mT[row[usable], col[usable]] = values[usable]
+    return HallFrame(message.stamp_ns, field_mT, valid, sensor_period_ns, message.representation)

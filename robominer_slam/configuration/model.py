@@ -1,0 +1,208 @@
+"""The configuration model: every parameter of the program in one place."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, field_validator
+
+from robominer_slam.configuration.parameter import Section, parameter
+
+
+class RobotSection(Section):
+    """Which robot this is."""
+
+    id: str = parameter("rm3", "", "part of every key on the network: robominer/<id>/...")
+    layout: str = parameter("thesis-grid", "", "built-in name (thesis-grid, rm3) or path of a layout file")
+    role: Literal["all", "drivers", "slam"] = parameter(
+        "all", "", "drivers: devices to the network only; slam: from the network; all: both on one board"
+    )
+
+    @field_validator("id")
+    @classmethod
+    def _one_key_chunk(cls, value: str) -> str:
+        if not value or any(c in "/*$?# " for c in value):
+            raise ValueError("expected a name without spaces and without / * $ ? #")
+        return value
+
+
+class DeviceSection(Section):
+    """One port and what is on it."""
+
+    name: str = Field(description="the device's name in status, logs and keys", json_schema_extra={"unit": ""})
+    port: str = Field(description="path, usb:VID:PID[:SERIAL] or auto", json_schema_extra={"unit": ""})
+    protocol: Literal["framed"] = parameter("framed", "", "what the device speaks")
+    baud: int = parameter(115200, "bit/s", "the Arduino default; USB CDC devices ignore it", low=1200, high=12_000_000)
+    calibration: str | None = parameter(None, "", "calibration file of the whiskers on this device")
+    ticks_per_turn: int = parameter(4096, "1", "encoder ticks per turn of a screw", low=1, high=10_000_000)
+    mount_rpy_deg: tuple[float, float, float] = parameter(
+        (0.0, 0.0, 0.0), "deg", "rotation of the IMU in base_link: roll, pitch, yaw, applied yaw first"
+    )
+    acceleration: Literal["specific_force", "gravity_free"] = parameter(
+        "specific_force", "", "gravity_free where the IMU's driver has removed gravity already"
+    )
+
+    @field_validator("name")
+    @classmethod
+    def _one_key_chunk(cls, value: str) -> str:
+        if not value or any(c in "/*$?# " for c in value):
+            raise ValueError("expected a name without spaces and without / * $ ? #")
+        return value
+
+
+class TopicsSection(Section):
+    """Names of a recording's topics, for replay of other people's recordings."""
+
+    whiskers: str = parameter("whiskers", "", "robominer_msgs/msg/WhiskerArray")
+    imu: str = parameter("imu", "", "sensor_msgs/msg/Imu")
+    screws: str = parameter("screws", "", "sensor_msgs/msg/JointState")
+    motor_module: str = parameter(
+        "{screw}/motor_module", "", "robominer_msgs/msg/MotorModuleFeedback; {screw} stands for the screw's name"
+    )
+    twist: str = parameter("odometry/twist", "", "geometry_msgs/msg/TwistStamped, a ready-made odometry")
+    ground_truth: str = parameter("ground_truth", "", "nav_msgs/msg/Odometry, where a simulator knows it")
+
+
+class ContactSection(Section):
+    """When a whisker counts as touching."""
+
+    min_inclination_deg: float = parameter(
+        4.0, "deg", "at rest the noise is 0.3 to 0.5 deg; 4 deg is a tip raised by 0.4 mm", low=0.5, high=30.0
+    )
+    max_inclination_deg: float = parameter(
+        70.0, "deg", "beyond this the rod lies along the surface and the tip assumption fails", low=20.0, high=85.0
+    )
+
+
+class ScrewsSection(Section):
+    """Geometry of the four screws; values of RM3 (Centre for Biorobotics)."""
+
+    radius: float = parameter(0.078, "m", "screw radius of RM3", low=0.005, high=1.0)
+    helix_angle_deg: float = parameter(30.0, "deg", "helix angle of RM3's screws", low=5.0, high=80.0)
+    half_track: float = parameter(0.15, "m", "lx: from the centre to a screw along x", low=0.01, high=5.0)
+    half_base: float = parameter(0.30, "m", "ly: from the centre to a screw along y", low=0.01, high=5.0)
+
+
+class EstimationSection(Section):
+    """Dead reckoning: the filter over body velocity, heading and gyro bias."""
+
+    source: Literal["fused", "odometry"] = parameter(
+        "fused", "", "fused: IMU and screws; odometry: the ready-made odometry alone"
+    )
+    sigma_screws_vx: float = parameter(
+        0.05, "m/s", "white part of the screws' error, slip is slower; RM3's crew found 0.16 with slip in it",
+        low=1e-4, high=10.0,
+    )  # fmt: skip
+    sigma_screws_vy: float = parameter(0.05, "m/s", "as for vx", low=1e-4, high=10.0)
+    sigma_screws_wz: float = parameter(
+        0.2, "rad/s", "RM3's crew found 0.22; the gyro is far better and decides the heading", low=1e-4, high=10.0
+    )
+    sigma_gyro: float = parameter(0.005, "rad/s", "BNO080 per sample at 100 Hz with margin", low=1e-5, high=1.0)
+    sigma_gyro_bias_start: float = parameter(0.002, "rad/s", "0.1 deg/s: a BNO080's bias at start", low=0.0, high=0.1)
+    gyro_bias_walk: float = parameter(1e-5, "rad/s/sqrt(s)", "slow drift of a consumer gyro", low=0.0, high=0.01)
+    acceleration_walk: float = parameter(
+        0.3,
+        "m/s2/sqrt(Hz)",
+        "how fast the robot's velocity may change: it accelerates at 0.2 m/s2",
+        low=0.01,
+        high=50.0,
+    )
+    angular_acceleration_walk: float = parameter(
+        2.0, "rad/s2/sqrt(Hz)", "how fast the turn rate may change", low=0.01, high=100.0
+    )
+    still_screw_speed: float = parameter(
+        0.05, "rad/s", "all screws slower than this: the robot stands, velocity zero", low=0.0, high=10.0
+    )
+    position_walk: float = parameter(
+        0.02, "m/sqrt(m)", "slip: how the position error grows with the distance driven", low=0.0, high=1.0
+    )
+    reorder_window: float = parameter(
+        0.5, "s", "measurements wait at most this long for an older one from another port", low=0.05, high=5.0
+    )
+
+
+class ThesisSection(Section):
+    """The thesis's pipeline; what it leaves unsaid comes from a search on scenario 3 (docs/slam.md)."""
+
+    matcher: Literal["ICP", "PLANE_ICP", "GICP", "VGICP"] = parameter(
+        "GICP", "", "the thesis chose FAST_GICP by visual inspection"
+    )
+    keyframe_distance: float = parameter(0.12, "m", "thesis 3.4.4: along x or y", low=0.01, high=5.0)
+    keyframe_angle: float = parameter(1.54, "rad", "thesis 3.4.4", low=0.05, high=6.3)
+    resolution: float = parameter(0.1, "m", "thesis 3.4.4: registration resolution", low=0.005, high=1.0)
+    search_radius: float = parameter(0.75, "m", "thesis 3.4.4: candidates within it", low=0.05, high=20.0)
+    max_fitness: float = parameter(0.016, "m2", "thesis 3.4.4: mean squared distance", low=1e-6, high=1.0)
+    scan_voxel: float = parameter(0.02, "m", "voxel filter per scan: by search", low=0.0, high=0.5)
+    correspondence_distance: float = parameter(0.5, "m", "by search", low=0.01, high=10.0)
+    min_travel: float = parameter(
+        1.0, "m", "driven since the candidate before a closure: by search", low=0.0, high=100.0
+    )
+    closure_spacing: float = parameter(0.3, "m", "driven between two closures: by search", low=0.0, high=100.0)
+    kernel: Literal["none", "huber", "cauchy"] = parameter("huber", "", "kernel of the closures: by search")
+
+
+class SlamSection(Section):
+    """Simultaneous localisation and mapping."""
+
+    method: Literal["thesis", "none"] = parameter("thesis", "", "thesis: its pipeline; none: odometry alone")
+    backend_latency: float = parameter(
+        0.5, "s", "a keyframe's result takes effect this long after it, in sensor time, so that replay equals run",
+        low=0.0, high=60.0,
+    )  # fmt: skip
+    backend_queue: int = parameter(
+        16, "1", "keyframes that may wait for the back-end; beyond, the front-end waits", low=1, high=1000
+    )
+    thesis: ThesisSection = Field(default_factory=ThesisSection)
+
+
+class MapSection(Section):
+    """The map as it is published."""
+
+    point_voxel: float = parameter(0.01, "m", "points of a keyframe closer than this are one", low=0.001, high=0.5)
+    grid_cell: float = parameter(0.05, "m", "cell of the published occupancy grid", low=0.005, high=1.0)
+    obstacle_height: float = parameter(
+        0.04, "m", "a step within a cell's neighbourhood that makes it an obstacle", low=0.005, high=1.0
+    )
+
+
+class StoreSection(Section):
+    """Where keyframes are kept."""
+
+    path: str = parameter("/var/lib/robominer-slam/map.db", "", "SQLite database of the maps")
+    sync_s: float = parameter(
+        2.0, "s", "a keyframe is on the disk at most this long after it was made", low=0.1, high=60.0
+    )
+
+
+class ZenohSection(Section):
+    """The network."""
+
+    listen: tuple[str, ...] = parameter(
+        ("tcp/127.0.0.1:7447",), "", "endpoints to listen on; loopback unless keys are configured"
+    )
+    connect: tuple[str, ...] = parameter((), "", "endpoints to connect to")
+    ros: Literal["none"] = parameter("none", "", "what ROS 2 bridges need in addition")
+
+
+class Configuration(Section):
+    """The whole configuration file."""
+
+    robot: RobotSection = Field(default_factory=RobotSection)
+    device: tuple[DeviceSection, ...] = ()
+    topics: TopicsSection = Field(default_factory=TopicsSection)
+    contact: ContactSection = Field(default_factory=ContactSection)
+    screws: ScrewsSection = Field(default_factory=ScrewsSection)
+    estimation: EstimationSection = Field(default_factory=EstimationSection)
+    slam: SlamSection = Field(default_factory=SlamSection)
+    map: MapSection = Field(default_factory=MapSection)
+    store: StoreSection = Field(default_factory=StoreSection)
+    zenoh: ZenohSection = Field(default_factory=ZenohSection)
+
+    @field_validator("device")
+    @classmethod
+    def _names_differ(cls, value: tuple[DeviceSection, ...]) -> tuple[DeviceSection, ...]:
+        names = [device.name for device in value]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"expected a name of its own for each device, {', '.join(twice)} stands twice")
+        return value

@@ -1,0 +1,32 @@
+"""How a parameter is declared: default, unit, range and the reason for its value."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class Section(BaseModel):
+    """A section of the configuration file: unknown keys are refused, values never change after loading."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=False, validate_default=True)
+
+
+def parameter(
+    default: Any,  # noqa: ANN401 - a default has the type of the field that it stands for
+    unit: str,
+    reason: str,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+) -> Any:  # noqa: ANN401 - pydantic's own idiom: a field's declaration stands for its value
+    """Declare a parameter.
+
+    Args:
+        default: the value when the file says nothing.
+        unit: SI unit or `1` for numbers without; empty for text.
+        reason: one sentence on why this value.
+        low, high: the range, both ends allowed.
+    """
+    return Field(default=default, ge=low, le=high, description=reason, json_schema_extra={"unit": unit})

@@ -1,0 +1,177 @@
+"""Dead reckoning from IMU and screws: an extended Kalman filter over pose, body velocity and gyro bias.
+
+State (x, y, yaw, vx, vy, wz, b): pose in odom, body velocity, gyro bias. The velocity is a random walk; the gyro
+measures wz + b, the screws (vx, vy, wz), and screws that stand still measure a velocity of zero (which makes the
+gyro bias visible). Slip is not white: it enters as an error of the position that grows with the distance driven.
+The body is taken as level.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter
+from numpy.typing import NDArray
+
+from drivers.measurement import ImuSample, Measurement, ScrewAngles, ScrewSpeeds
+from robominer_slam.estimation.odometry_state import OdometryState
+
+FloatArray = NDArray[np.float64]
+
+X, Y, YAW, VX, VY, WZ, BIAS = range(7)
+STATE = 7
+#: A gap in the screws' readings longer than this has no meaningful mean speed.
+MAX_SCREW_INTERVAL_S = 0.5
+
+H_GYRO = np.zeros((1, STATE))
+H_GYRO[0, [WZ, BIAS]] = 1.0
+H_VELOCITY = np.zeros((3, STATE))
+H_VELOCITY[[0, 1, 2], [VX, VY, WZ]] = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class FilterNoise:
+    """Noise of the filter; the configuration's `[estimation]` gives values, units and reasons."""
+
+    screws: tuple[float, float, float]
+    gyro: float
+    gyro_bias_start: float
+    gyro_bias_walk: float
+    acceleration_walk: float
+    angular_acceleration_walk: float
+    position_walk: float
+    still_screw_speed: float
+    still_velocity: tuple[float, float, float] = (0.002, 0.002, 0.002)
+
+
+def motion(state: FloatArray, dt: float) -> FloatArray:
+    """The state `dt` seconds later at constant body velocity, shape (7,); midpoint in the heading."""
+    heading = state[YAW] + 0.5 * state[WZ] * dt
+    c, s = np.cos(heading), np.sin(heading)
+    later = state.copy()
+    later[X] += (c * state[VX] - s * state[VY]) * dt
+    later[Y] += (s * state[VX] + c * state[VY]) * dt
+    later[YAW] += state[WZ] * dt
+    return later
+
+
+def motion_jacobian(state: FloatArray, dt: float) -> FloatArray:
+    """Derivative of `motion` by the state, shape (7, 7)."""
+    heading = state[YAW] + 0.5 * state[WZ] * dt
+    c, s = np.cos(heading), np.sin(heading)
+    F = np.eye(STATE)
+    dx_heading = (-s * state[VX] - c * state[VY]) * dt
+    dy_heading = (c * state[VX] - s * state[VY]) * dt
+    F[X, [YAW, VX, VY, WZ]] = dx_heading, c * dt, -s * dt, 0.5 * dt * dx_heading
+    F[Y, [YAW, VX, VY, WZ]] = dy_heading, s * dt, c * dt, 0.5 * dt * dy_heading
+    F[YAW, WZ] = dt
+    return F
+
+
+def gyro_measurement(state: FloatArray) -> FloatArray:
+    """What the gyro's vertical axis reads, shape (1,), rad/s."""
+    return H_GYRO @ state
+
+
+def velocity_measurement(state: FloatArray) -> FloatArray:
+    """The body velocity, shape (3,)."""
+    return state[VX : WZ + 1]
+
+
+class _PlanarFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has no types
+    """filterpy's filter with our motion as its prediction."""
+
+    dt = 0.0
+
+    def predict_x(self, u: float = 0.0) -> None:  # noqa: ARG002 - filterpy's signature; there is no input
+        self.x: FloatArray = motion(self.x, self.dt)
+
+
+class FusedOdometry:
+    """Fuses IMU (gyro) and screws; measurements come in the order of their stamps.
+
+    Args:
+        noise: see `FilterNoise`.
+        screw_matrix: from `screw_kinematics.forward_matrix`, shape (4, 4).
+    """
+
+    def __init__(self, noise: FilterNoise, screw_matrix: FloatArray) -> None:
+        self._noise = noise
+        self._screw_matrix = screw_matrix
+        self._filter = _PlanarFilter(dim_x=STATE, dim_z=3)
+        self._filter.x = np.zeros(STATE)
+        self._filter.P = np.diag([0.0, 0.0, 0.0, 1e-4, 1e-4, 1e-4, noise.gyro_bias_start**2])
+        self._stamp_ns: int | None = None
+        self._screws: ScrewAngles | None = None
+        self._R_gyro = np.array([[noise.gyro**2]])
+        self._R_screws = np.diag(np.square(noise.screws))
+        self._R_still = np.diag(np.square(noise.still_velocity))
+        self.stale = 0
+
+    def add(self, measurement: Measurement) -> None:
+        """Take an IMU sample or a screws' reading; others are ignored."""
+        match measurement:
+            case ImuSample(gyro=gyro) if gyro is not None:
+                self._predict(measurement.stamp_ns)
+                self._filter.update(gyro[2:3], lambda _: H_GYRO, gyro_measurement, self._R_gyro)
+            case ScrewAngles():
+                self._add_angles(measurement)
+            case ScrewSpeeds(speed=speed) if np.isfinite(speed).all():
+                self._predict(measurement.stamp_ns)
+                self._update_screws(speed)
+            case _:
+                pass
+
+    def state_at(self, stamp_ns: int) -> OdometryState:
+        """The state at a time that is not before the last measurement's."""
+        self._predict(stamp_ns)
+        x, P = self._filter.x, self._filter.P
+        return OdometryState(
+            stamp_ns,
+            float(x[X]),
+            float(x[Y]),
+            float(x[YAW]),
+            x[VX : WZ + 1].copy(),
+            P[:VX, :VX].copy(),
+            P[VX : WZ + 1, VX : WZ + 1].copy(),
+        )
+
+    @property
+    def gyro_bias(self) -> float:
+        """Estimated gyro bias, rad/s."""
+        return float(self._filter.x[BIAS])
+
+    def _add_angles(self, reading: ScrewAngles) -> None:
+        previous, self._screws = self._screws, reading
+        if previous is None:
+            return
+        interval = (reading.stamp_ns - previous.stamp_ns) * 1e-9
+        if not 0.0 < interval <= MAX_SCREW_INTERVAL_S:
+            self.stale += 1
+            return
+        self._predict(reading.stamp_ns)
+        self._update_screws((reading.angle - previous.angle) / interval)
+
+    def _update_screws(self, speed: FloatArray) -> None:
+        if np.abs(speed).max() < self._noise.still_screw_speed:
+            self._filter.update(np.zeros(3), lambda _: H_VELOCITY, velocity_measurement, self._R_still)
+        else:
+            velocity = (self._screw_matrix @ speed)[:3]
+            self._filter.update(velocity, lambda _: H_VELOCITY, velocity_measurement, self._R_screws)
+
+    def _predict(self, stamp_ns: int) -> None:
+        previous = self._stamp_ns
+        if previous is None or stamp_ns <= previous:
+            self._stamp_ns = stamp_ns if previous is None else previous
+            return
+        self._stamp_ns = stamp_ns
+        ekf, noise = self._filter, self._noise
+        ekf.dt = (stamp_ns - previous) * 1e-9
+        ekf.F = motion_jacobian(ekf.x, ekf.dt)
+        driven = float(np.hypot(ekf.x[VX], ekf.x[VY])) * ekf.dt
+        slip = noise.position_walk**2 * driven
+        walk = noise.acceleration_walk**2 * ekf.dt
+        turn = noise.angular_acceleration_walk**2 * ekf.dt
+        ekf.Q = np.diag([slip, slip, 0.0, walk, walk, turn, noise.gyro_bias_walk**2 * ekf.dt])
+        ekf.predict()
