@@ -38,6 +38,11 @@ class AngleEstimator:
         self._offset_mT = np.zeros_like(model.rest_mT)
         self.out_of_range = 0
 
+    @property
+    def count(self) -> int:
+        """Number of whiskers in the array, holes included."""
+        return len(self._model.rest_mT)
+
     def angles(self, field_mT: FloatArray, valid: NDArray[np.bool_]) -> WhiskerAngles:
         """Angles of one reading.
 

@@ -49,7 +49,7 @@ class SerialReader:
         for one in settings:
             check_port_name(one.port)
         self._ports = [_OpenPort(Device(one)) for one in settings]
-        self._queue: queue.Queue[Measurement] = queue.Queue(QUEUE_LENGTH)
+        self._queue: queue.Queue[tuple[str, Measurement]] = queue.Queue(QUEUE_LENGTH)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="drivers", daemon=True)
         self._selector = selectors.DefaultSelector()
@@ -67,8 +67,8 @@ class SerialReader:
             self._close(entry)
         self._selector.close()
 
-    def get(self, timeout: float) -> Measurement | None:
-        """The next measurement, or None after `timeout` seconds.
+    def get(self, timeout: float) -> tuple[str, Measurement] | None:
+        """The next (device, measurement), or None after `timeout` seconds.
 
         Raises:
             RuntimeError: the thread itself failed (our own fault, never a device's).
@@ -142,7 +142,7 @@ class SerialReader:
         if not data:
             return
         for measurement in entry.device.received(data, arrival_ns):
-            self._deliver(measurement)
+            self._deliver(entry.device.settings.name, measurement)
 
     def _write(self, entry: _OpenPort, now_ns: int) -> None:
         if entry.port is None:
@@ -157,10 +157,10 @@ class SerialReader:
         except (serial.SerialException, OSError) as error:
             self._lost(entry, f"write failed: {_reason(error)}")
 
-    def _deliver(self, measurement: Measurement) -> None:
+    def _deliver(self, device: str, measurement: Measurement) -> None:
         while True:
             try:
-                self._queue.put_nowait(measurement)
+                self._queue.put_nowait((device, measurement))
                 return
             except queue.Full:
                 # The newest matter most to a robot that is behind; the loss is counted and reported.

@@ -172,7 +172,8 @@ def decode_frame(data: bytes, counters: Counters, sensor_period_ns: int = 0) -> 
     values = np.stack([whiskers["x"], whiskers["y"], whiskers["z"]], axis=1).astype(np.float64)
     usable = whiskers["has_error"] == 0
     finite = np.isfinite(values).all(axis=1)
-    counters["not_finite"] += int(np.count_nonzero(usable & ~finite))
+    if not_finite := int(np.count_nonzero(usable & ~finite)):
+        counters["not_finite"] += not_finite
     usable &= finite
     field_mT = np.zeros((rows, cols, 3))
     valid = np.zeros((rows, cols), dtype=np.bool_)

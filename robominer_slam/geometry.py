@@ -10,8 +10,8 @@ Conventions, everywhere in the project:
   first order in d. The left ones are those of -xi.
 
 Sources: Sola, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics" (2018); Barfoot, "State
-Estimation for Robotics", chapter 7. Rotations alone are in
-`geometry_rotations`, motions in the plane in `geometry_planar`; all their names can be had from here.
+Estimation for Robotics", chapter 7. Rotations alone are in `geometry_rotations`, motions in the plane in
+`geometry_planar`; all their names can be had from here.
 """
 
 from __future__ import annotations

@@ -63,6 +63,7 @@ def sine_coefficient(x2: FloatArray) -> FloatArray:
 
 
 def squared_norm(v: FloatArray) -> FloatArray:
+    """Squared lengths (...,) of vectors (..., n)."""
     return np.asarray(np.einsum("...i,...i->...", v, v))
 
 
@@ -73,7 +74,7 @@ def wrap_angle(angle: ArrayLike) -> FloatArray:
 
 
 def hat(v: ArrayLike) -> FloatArray:
-    """Cross-product matrices [v]x (..., 3, 3) of vectors (..., 3), so that hat(v) @ u is v x u."""
+    """Cross-product matrices [v]x (..., 3, 3) of vectors (..., 3): times u they give v x u."""
     w = np.asarray(v, dtype=np.float64)
     out = np.zeros((*w.shape, 3))
     out[..., 2, 1] = w[..., 0]

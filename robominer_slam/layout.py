@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -187,22 +186,3 @@ def from_json(text: str, where: str) -> WhiskerLayout:
     except (TypeError, ValueError) as error:
         raise LayoutError(f"{where}: not a layout file ({error})") from error
     return WhiskerLayout(name, rows, cols, p, R, length, present)
-
-
-def load(name_or_path: str, relative_to: Path | None = None) -> WhiskerLayout:
-    """A built-in layout by name, or one from a file.
-
-    Raises:
-        LayoutError: neither a built-in name nor a readable layout file.
-    """
-    if name_or_path in BUILT_IN:
-        return BUILT_IN[name_or_path]()
-    path = Path(name_or_path)
-    if relative_to is not None and not path.is_absolute():
-        path = relative_to / path
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        known = ", ".join(BUILT_IN)
-        raise LayoutError(f"layout {name_or_path!r}: not built in ({known}) and {error}") from error
-    return from_json(text, str(path))

@@ -56,10 +56,11 @@ class TopicsSection(Section):
     whiskers: str = parameter("whiskers", "", "robominer_msgs/msg/WhiskerArray")
     imu: str = parameter("imu", "", "sensor_msgs/msg/Imu")
     screws: str = parameter("screws", "", "sensor_msgs/msg/JointState")
-    motor_module: str = parameter(
-        "{screw}/motor_module", "", "robominer_msgs/msg/MotorModuleFeedback; {screw} stands for the screw's name"
-    )
-    twist: str = parameter("odometry/twist", "", "geometry_msgs/msg/TwistStamped, a ready-made odometry")
+    front_right_motor: str = parameter("front_right/motor_module", "", "robominer_msgs/msg/MotorModuleFeedback")
+    rear_right_motor: str = parameter("rear_right/motor_module", "", "as front_right_motor")
+    rear_left_motor: str = parameter("rear_left/motor_module", "", "as front_right_motor")
+    front_left_motor: str = parameter("front_left/motor_module", "", "as front_right_motor")
+    odometry: str = parameter("odometry/twist", "", "geometry_msgs/msg/TwistStamped, a ready-made odometry")
     ground_truth: str = parameter("ground_truth", "", "nav_msgs/msg/Odometry, where a simulator knows it")
 
 

@@ -1,0 +1,93 @@
+"""From configuration, layout and calibration to a pipeline: the one place where its parts are put together."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.angle_estimator import AngleEstimator
+from calibration.polynomial import PolynomialModel
+from robominer_slam.configuration.model import Configuration, EstimationSection
+from robominer_slam.contacts import ContactModel
+from robominer_slam.estimation.fused_odometry import FilterNoise, FusedOdometry
+from robominer_slam.estimation.integrated_odometry import IntegratedOdometry
+from robominer_slam.estimation.odometry_state import DeadReckoning
+from robominer_slam.estimation.screw_kinematics import forward_matrix
+from robominer_slam.layout import WhiskerLayout
+from robominer_slam.pipeline import Pipeline
+from robominer_slam.slam.backend_runner import BackendRunner, SynchronousRunner, ThreadedRunner
+from robominer_slam.slam.composite_scan import CompositeScan
+from robominer_slam.slam.thesis import ThesisBackend
+
+FloatArray = NDArray[np.float64]
+Execution = Literal["synchronous", "threaded"]
+
+
+def build_pipeline(
+    configuration: Configuration, layout: WhiskerLayout, model: PolynomialModel, execution: Execution
+) -> Pipeline:
+    """Assemble the pipeline; `threaded` for the daemon, `synchronous` for replay."""
+    composite: CompositeScan | None = None
+    runner: BackendRunner | None = None
+    slam = configuration.slam
+    if slam.method == "thesis":
+        thesis = slam.thesis
+        composite = CompositeScan(thesis.keyframe_distance, thesis.keyframe_angle, thesis.scan_voxel)
+        backend = ThesisBackend(thesis)
+        latency_ns = round(slam.backend_latency * 1e9)
+        if execution == "threaded":
+            runner = ThreadedRunner(backend, latency_ns, slam.backend_queue)
+        else:
+            runner = SynchronousRunner(backend, latency_ns)
+    contact = configuration.contact
+    return Pipeline(
+        dead_reckoning=_dead_reckoning(configuration),
+        angle_estimator=AngleEstimator(model),
+        contact_model=ContactModel(
+            layout, np.deg2rad(contact.min_inclination_deg), np.deg2rad(contact.max_inclination_deg)
+        ),
+        composite_scan=composite,
+        runner=runner,
+        imu_mounts={
+            device.name: rotation_from_rpy(*np.deg2rad(device.mount_rpy_deg))
+            for device in configuration.device
+            if any(device.mount_rpy_deg)
+        },
+        reorder_window_ns=round(configuration.estimation.reorder_window * 1e9),
+    )
+
+
+def _dead_reckoning(configuration: Configuration) -> DeadReckoning:
+    if configuration.estimation.source == "odometry":
+        return IntegratedOdometry()
+    screws = configuration.screws
+    matrix = forward_matrix(screws.radius, np.deg2rad(screws.helix_angle_deg), screws.half_track, screws.half_base)
+    return FusedOdometry(filter_noise(configuration.estimation), matrix)
+
+
+def filter_noise(estimation: EstimationSection) -> FilterNoise:
+    """The filter's noise from the configuration."""
+    return FilterNoise(
+        screws=(estimation.sigma_screws_vx, estimation.sigma_screws_vy, estimation.sigma_screws_wz),
+        gyro=estimation.sigma_gyro,
+        gyro_bias_start=estimation.sigma_gyro_bias_start,
+        gyro_bias_walk=estimation.gyro_bias_walk,
+        acceleration_walk=estimation.acceleration_walk,
+        angular_acceleration_walk=estimation.angular_acceleration_walk,
+        position_walk=estimation.position_walk,
+        still_screw_speed=estimation.still_screw_speed,
+    )
+
+
+def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> FloatArray:
+    """Rz(yaw) Ry(pitch) Rx(roll), shape (3, 3): yaw, then pitch, then roll about the turned axes; rad."""
+    cr, sr, cp, sp, cy, sy = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )

@@ -1,0 +1,62 @@
+"""`robominer-slam evaluate`: trajectories against ground truth, with the thesis's path figure."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+from rich.console import Console
+from rich.table import Table
+
+from robominer_slam.evaluation.report import ERROR_COLUMNS, DriveReport, drive_report, report_rows
+from robominer_slam.evaluation.trajectory import Trajectory, parse_tum
+
+FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Read a TUM trajectory; raises TrajectoryError."""
+    with path.open(encoding="utf-8") as file:
+        return parse_tum(file, str(path))
+
+
+def print_report(report: DriveReport, title: str) -> None:
+    """The table on stdout."""
+    errors, figures = report_rows(report)
+    table = Table(title=title)
+    for column in ERROR_COLUMNS:
+        table.add_column(column, justify="left" if column == "method" else "right")
+    for row in errors:
+        table.add_row(*row)
+    console = Console()
+    console.print(table)
+    for name, value in figures:
+        console.print(f"{name:>40}: {value}", highlight=False)
+
+
+@click.command(epilog="Example: robominer-slam evaluate --truth truth.tum --odometry odometry.tum --slam slam.tum")
+@click.option("--truth", type=FILE, required=True, help="Ground truth, TUM format.")
+@click.option("--odometry", type=FILE, required=True, help="Dead reckoning alone, TUM format.")
+@click.option("--slam", type=FILE, required=True, help="Poses as published, TUM format.")
+@click.option("--graph", "graph_file", type=FILE, help="Pose graph, the JSON of map/graph.")
+@click.option("--figure", type=click.Path(dir_okay=False, path_type=Path), help="Path figure to write (PNG).")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def evaluate(
+    truth: Path, odometry: Path, slam: Path, graph_file: Path | None, figure: Path | None, as_json: bool
+) -> None:
+    """Errors of odometry and SLAM against ground truth, frame by frame, without alignment."""
+    trajectories = {name: read_tum(path) for name, path in (("truth", truth), ("odom", odometry), ("slam", slam))}
+    graph = json.loads(graph_file.read_text(encoding="utf-8")) if graph_file else {"keyframes": [], "edges": []}
+    try:
+        report = drive_report(trajectories["slam"], trajectories["odom"], trajectories["truth"], graph)
+    except ValueError as error:
+        raise click.UsageError(str(error)) from error
+    if figure is not None:
+        from robominer_slam.evaluation.figures import path_figure  # matplotlib is in the extras only
+
+        path_figure(figure, trajectories["truth"], trajectories["odom"], trajectories["slam"], slam.stem)
+    if as_json:
+        click.echo(json.dumps(report.as_dict()))
+    else:
+        print_report(report, slam.stem)

@@ -1,0 +1,92 @@
+"""`robominer-slam`: finds its subcommands, and turns users' mistakes into one line and exit code 2."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import sys
+from importlib.metadata import entry_points
+
+import click
+
+from calibration.file_format import CalibrationFileError
+from calibration.fit import FitError
+from drivers.port_discovery import PortNameError
+from drivers.recording_reader import RecordingError
+from robominer_slam import __version__
+from robominer_slam.configuration.file import ConfigurationError
+from robominer_slam.evaluation.trajectory import TrajectoryError
+from robominer_slam.layout import LayoutError
+from robominer_slam.publishing.zenoh_session import ZenohSetupError
+from robominer_slam.store import StoreError
+
+#: Errors that are the user's to mend; anything else is ours and shows a traceback.
+USER_ERRORS = (
+    CalibrationFileError,
+    ConfigurationError,
+    FitError,
+    LayoutError,
+    PortNameError,
+    RecordingError,
+    StoreError,
+    TrajectoryError,
+    ZenohSetupError,
+)
+
+#: Imported only when called, so that `--help` and the daemon load no more than they need.
+COMMANDS = {
+    "calibrate": "robominer_slam.cli.calibrate:calibrate",
+    "evaluate": "robominer_slam.cli.evaluate:evaluate",
+    "graph": "robominer_slam.cli.graph:graph",
+    "replay": "robominer_slam.cli.replay:replay",
+    "run": "robominer_slam.cli.run:run",
+    "status": "robominer_slam.cli.status:status",
+}
+ENTRY_POINT_GROUP = "robominer_slam.commands"
+
+
+class _Commands(click.Group):
+    """Our own subcommands and those that other packages register by entry point."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
+        return sorted([*COMMANDS, *(point.name for point in entry_points(group=ENTRY_POINT_GROUP))])
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:  # noqa: ARG002 - click's signature
+        if name in COMMANDS:
+            module, attribute = COMMANDS[name].split(":")
+            command: click.Command = getattr(importlib.import_module(module), attribute)
+            return command
+        for point in entry_points(group=ENTRY_POINT_GROUP, name=name):
+            loaded: click.Command = point.load()
+            return loaded
+        return None
+
+
+@click.group(
+    cls=_Commands,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog="Example: robominer-slam run --config /etc/robominer-slam/config.toml",
+)
+@click.version_option(__version__, prog_name="robominer-slam")
+@click.option("-v", "--verbose", count=True, help="More of what happens, on stderr.")
+def cli(verbose: int) -> None:
+    """Blind SLAM for a mining robot: whisker touches in, pose and map out."""
+    level = [logging.INFO, logging.DEBUG][min(verbose, 1)]
+    logging.basicConfig(level=level, stream=sys.stderr, format="%(levelname)s %(name)s: %(message)s")
+
+
+def main() -> None:
+    """Entry point of the program."""
+    try:
+        cli.main(standalone_mode=False)
+    except click.exceptions.Exit as done:
+        sys.exit(done.exit_code)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except click.Abort:
+        sys.exit(130)
+    except USER_ERRORS as error:
+        for line in str(error).splitlines():
+            click.echo(f"error: {line}", err=True)
+        sys.exit(2)

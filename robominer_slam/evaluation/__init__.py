@@ -1,0 +1,1 @@
+"""Trajectories and graphs against ground truth: metrics, and the thesis's figures."""

@@ -1,0 +1,47 @@
+"""What the pipeline says after each whisker frame: all that is published of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.angle_estimator import WhiskerAngles
+from robominer_slam.contacts import Contacts
+from robominer_slam.estimation.odometry_state import OdometryState
+from robominer_slam.slam.keyframe import BackendResult, Keyframe
+
+FloatArray = NDArray[np.float64]
+LocalizationState = Literal["lost", "relocalizing", "dead_reckoning", "tracking"]
+
+
+@dataclass(frozen=True, slots=True)
+class FrameResult:
+    """The robot at the time of one whisker frame.
+
+    Attributes:
+        stamp_ns: time of the frame's first sensor, in the measurements' clock.
+        odometry: dead reckoning's state.
+        T_odom_base, T_map_odom, T_map_base: poses, shape (4, 4).
+        covariance: of (x, y, yaw) in map, shape (3, 3).
+        angles: of all whiskers.
+        contacts: of those that touch.
+        state: how sure the localisation is.
+        keyframe: the keyframe that this frame completed, or None.
+        backend_results: results of the back-end that took effect with this frame.
+    """
+
+    stamp_ns: int
+    odometry: OdometryState
+    T_odom_base: FloatArray
+    T_map_odom: FloatArray
+    T_map_base: FloatArray
+    covariance: FloatArray
+    angles: WhiskerAngles
+    contacts: Contacts
+    state: LocalizationState
+    keyframe: Keyframe | None
+    backend_results: Sequence[BackendResult]

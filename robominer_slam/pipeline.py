@@ -1,0 +1,185 @@
+"""The way of a measurement: field -> angles -> contacts -> pose and map. No I/O; replay and the daemon share it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.angle_estimator import AngleEstimator
+from drivers.measurement import HallFrame, ImuSample, Measurement
+from robominer_slam import geometry
+from robominer_slam.contacts import ContactModel
+from robominer_slam.estimation.odometry_state import DeadReckoning, OdometryState
+from robominer_slam.frame_result import FrameResult, LocalizationState
+from robominer_slam.reorder import ReorderBuffer
+from robominer_slam.slam.backend_runner import BackendRunner
+from robominer_slam.slam.composite_scan import CompositeScan
+from robominer_slam.slam.keyframe import BackendResult, Keyframe
+
+FloatArray = NDArray[np.float64]
+
+#: Without contacts for this long there is nothing to localise on.
+BLIND_NS = 2_000_000_000
+
+
+class Pipeline:
+    """Takes measurements of any device in any order; gives a result for every whisker frame.
+
+    Args:
+        dead_reckoning: pose in odom.
+        angle_estimator: the array's calibration.
+        contact_model: who touches, where.
+        composite_scan: makes keyframes; None for odometry alone.
+        runner: of the back-end; None for odometry alone.
+        imu_mounts: rotation of each device's IMU in base_link, shape (3, 3), by device name.
+        reorder_window_ns: see `ReorderBuffer`.
+    """
+
+    def __init__(
+        self,
+        dead_reckoning: DeadReckoning,
+        angle_estimator: AngleEstimator,
+        contact_model: ContactModel,
+        composite_scan: CompositeScan | None,
+        runner: BackendRunner | None,
+        imu_mounts: Mapping[str, FloatArray],
+        reorder_window_ns: int,
+    ) -> None:
+        self.reorder = ReorderBuffer(reorder_window_ns)
+        self.angle_estimator = angle_estimator
+        self.runner = runner
+        self.paused = False
+        self.wrong_size_frames = 0
+        self._dead_reckoning = dead_reckoning
+        self._contact_model = contact_model
+        self._composite = composite_scan
+        self._imu_mounts = imu_mounts
+        self._T_map_odom = np.eye(4)
+        self._last_result: BackendResult | None = None
+        self._odometry_at_result: FloatArray | None = None
+        self._odometry_of_keyframe: dict[int, FloatArray] = {}
+        self._contact_ns: int | None = None
+        self._last_frame: HallFrame | None = None
+
+    def add(self, device: str, measurement: Measurement) -> list[FrameResult]:
+        """Take a measurement of a device; returns the results of the frames that it releases."""
+        return self._process(self.reorder.add(device, measurement))
+
+    def finish(self) -> list[FrameResult]:
+        """Process what still waits for its turn, at the end of the measurements."""
+        return self._process(self.reorder.flush())
+
+    def rezero(self) -> bool:
+        """Take the last frame as the array's rest position; False if there was none."""
+        if self._last_frame is None:
+            return False
+        self.angle_estimator.rezero(self._last_frame.field_mT, self._last_frame.valid)
+        return True
+
+    def localize(self, x: float, y: float, yaw: float) -> None:
+        """Place the robot: map -> odom such that base_link is at (x, y) with heading yaw (m, rad) now."""
+        stamp = self._last_frame.stamp_ns if self._last_frame is not None else 0
+        T_odom_base = planar_pose(self._dead_reckoning.state_at(stamp))
+        self._T_map_odom = planar(x, y, yaw) @ geometry.inverse(T_odom_base)
+
+    def _process(self, due: list[tuple[str, Measurement]]) -> list[FrameResult]:
+        results = []
+        for device, measurement in due:
+            if isinstance(measurement, HallFrame):
+                result = self._frame(measurement)
+                if result is not None:
+                    results.append(result)
+            elif isinstance(measurement, ImuSample):
+                self._dead_reckoning.add(self._in_base(device, measurement))
+            else:
+                self._dead_reckoning.add(measurement)
+        return results
+
+    def _frame(self, frame: HallFrame) -> FrameResult | None:
+        if frame.valid.size != self.angle_estimator.count:
+            self.wrong_size_frames += 1
+            return None
+        self._last_frame = frame
+        stamp = frame.stamp_ns
+        angles = self.angle_estimator.angles(frame.field_mT, frame.valid)
+        contacts = self._contact_model.contacts(angles.inclination, angles.azimuth, angles.valid)
+        if len(contacts.index):
+            self._contact_ns = stamp
+        odometry = self._dead_reckoning.state_at(stamp)
+        T_odom_base = planar_pose(odometry)
+        backend_results = self.runner.due(stamp) if self.runner is not None else []
+        for result in backend_results:
+            self._take(result)
+        keyframe = self._keyframe(stamp, T_odom_base, contacts.points, odometry)
+        return FrameResult(
+            stamp_ns=stamp,
+            odometry=odometry,
+            T_odom_base=T_odom_base,
+            T_map_odom=self._T_map_odom,
+            T_map_base=self._T_map_odom @ T_odom_base,
+            covariance=self._covariance(odometry),
+            angles=angles,
+            contacts=contacts,
+            state=self._state(stamp),
+            keyframe=keyframe,
+            backend_results=backend_results,
+        )
+
+    def _keyframe(
+        self, stamp: int, T_odom_base: FloatArray, points: FloatArray, odometry: OdometryState
+    ) -> Keyframe | None:
+        if self._composite is None or self.runner is None or self.paused:
+            return None
+        keyframe = self._composite.add(stamp, T_odom_base, points)
+        if keyframe is not None:
+            self._odometry_of_keyframe[keyframe.id] = odometry.covariance
+            self.runner.submit(keyframe)
+        return keyframe
+
+    def _take(self, result: BackendResult) -> None:
+        self._T_map_odom = result.T_map_odom
+        self._last_result = result
+        self._odometry_at_result = self._odometry_of_keyframe.pop(result.keyframe.id)
+
+    def _covariance(self, odometry: OdometryState) -> FloatArray:
+        """Covariance of (x, y, yaw) in map: the keyframe's from the graph, grown by odometry since."""
+        c, s = self._T_map_odom[0, 0], self._T_map_odom[1, 0]
+        R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        if self._last_result is None or self._odometry_at_result is None:
+            covariance: FloatArray = R @ odometry.covariance @ R.T
+            return covariance
+        grown = np.maximum(np.diag(odometry.covariance - self._odometry_at_result), 0.0)
+        covariance = self._last_result.covariance + R @ np.diag(grown) @ R.T
+        return covariance
+
+    def _state(self, stamp: int) -> LocalizationState:
+        if self.runner is None or self._contact_ns is None or stamp - self._contact_ns > BLIND_NS or self.paused:
+            return "dead_reckoning"
+        return "tracking"
+
+    def _in_base(self, device: str, sample: ImuSample) -> ImuSample:
+        R = self._imu_mounts.get(device)
+        if R is None:
+            return sample
+        return replace(
+            sample,
+            gyro=None if sample.gyro is None else R @ sample.gyro,
+            acceleration=None if sample.acceleration is None else R @ sample.acceleration,
+        )
+
+
+def planar(x: float, y: float, yaw: float) -> FloatArray:
+    """Pose matrix, shape (4, 4), of a level body at (x, y, 0) with a heading."""
+    T = np.eye(4)
+    c, s = np.cos(yaw), np.sin(yaw)
+    T[:2, :2] = [[c, -s], [s, c]]
+    T[:2, 3] = x, y
+    return T
+
+
+def planar_pose(state: OdometryState) -> FloatArray:
+    """Pose of base_link in odom, shape (4, 4)."""
+    return planar(state.x, state.y, state.yaw)

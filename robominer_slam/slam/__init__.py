@@ -1,0 +1,1 @@
+"""Keyframe SLAM on touches: composite scans, registration, loop closures, pose graph. No I/O."""

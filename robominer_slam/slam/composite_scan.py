@@ -1,0 +1,103 @@
+"""Whisker scans summed by odometry into composite scans, which become keyframes (thesis, section 3.4.4)."""
+
+from __future__ import annotations
+
+import numpy as np
+import small_gicp
+from numpy.typing import NDArray
+
+from robominer_slam import geometry
+from robominer_slam.slam.keyframe import Keyframe
+
+FloatArray = NDArray[np.float64]
+
+#: A scan taken where the robot already stood adds nothing but its noise: standing still must not fill the memory.
+MIN_MOVE_M = 0.002
+MIN_TURN_RAD = 0.003
+#: Bound on a keyframe's points; a full turn on the spot makes about 6000.
+MAX_POINTS = 20_000
+
+
+def voxel_filter(points: FloatArray, voxel: float) -> FloatArray:
+    """Mean of the points in each occupied voxel, shape (m, 3); all points where `voxel` is 0 m."""
+    if voxel <= 0.0 or len(points) == 0:
+        return points
+    sampled: FloatArray = np.asarray(small_gicp.voxelgrid_sampling(points, voxel).points(), dtype=np.float64)[:, :3]
+    return sampled
+
+
+class CompositeScan:
+    """Collects scans until the robot has moved far enough, then hands out a keyframe.
+
+    Args:
+        distance: along odom's x or y, m.
+        angle: of the heading, rad.
+        scan_voxel: voxel filter of each scan, m; 0 for none.
+    """
+
+    def __init__(self, distance: float, angle: float, scan_voxel: float) -> None:
+        self._distance = distance
+        self._angle = angle
+        self._voxel = scan_voxel
+        self._scans: list[FloatArray] = []
+        self._count = 0
+        self._start: FloatArray | None = None
+        self._last: FloatArray | None = None
+        self._added: FloatArray | None = None
+        self._travelled = 0.0
+        self._next_id = 0
+        self.dropped_points = 0
+
+    def add(self, stamp_ns: int, T_odom_base: FloatArray, points: FloatArray) -> Keyframe | None:
+        """Add a scan.
+
+        Args:
+            stamp_ns: its time.
+            T_odom_base: pose in odom, shape (4, 4).
+            points: contacts in base_link, shape (m, 3), m; may be empty.
+
+        Returns:
+            The keyframe that this scan completes, or None.
+        """
+        if self._last is None or self._start is None:
+            self._start = self._last = T_odom_base
+        self._travelled += float(np.linalg.norm(T_odom_base[:3, 3] - self._last[:3, 3]))
+        self._last = T_odom_base
+        if len(points) and self._moved(T_odom_base):
+            self._added = T_odom_base
+            scan = voxel_filter(points, self._voxel)
+            if self._count + len(scan) > MAX_POINTS:
+                self.dropped_points += len(scan)
+            else:
+                self._scans.append(geometry.transform_points(T_odom_base, scan))
+                self._count += len(scan)
+        if not self._complete(T_odom_base):
+            return None
+        self._start = T_odom_base
+        if not self._scans:
+            return None
+        odom_points = np.concatenate(self._scans)
+        self._scans, self._count = [], 0
+        points_base = geometry.transform_points(geometry.inverse(T_odom_base), odom_points)
+        keyframe = Keyframe(self._next_id, stamp_ns, T_odom_base, points_base, self._travelled)
+        self._next_id += 1
+        return keyframe
+
+    def _moved(self, T_odom_base: FloatArray) -> bool:
+        if self._added is None:
+            return True
+        step = T_odom_base[:3, 3] - self._added[:3, 3]
+        return bool(np.linalg.norm(step) >= MIN_MOVE_M) or _turn(self._added, T_odom_base) >= MIN_TURN_RAD
+
+    def _complete(self, T_odom_base: FloatArray) -> bool:
+        start = self._start
+        if start is None:
+            return False
+        moved = np.abs(T_odom_base[:2, 3] - start[:2, 3]).max()
+        return bool(moved >= self._distance) or _turn(start, T_odom_base) >= self._angle
+
+
+def _turn(T_a: FloatArray, T_b: FloatArray) -> float:
+    """Heading change between two poses, rad, 0 to pi."""
+    relative = T_a[:3, :3].T @ T_b[:3, :3]
+    return float(abs(np.arctan2(relative[1, 0], relative[0, 0])))
