@@ -59,7 +59,6 @@ def to_text(report: FitReport, *, array_id: str, layout: str, rows: int, cols: i
                 "sigma_deg": float(np.rad2deg(model.sigma[i])),
                 "max_inclination_deg": float(np.rad2deg(model.max_inclination[i])),
                 "rest_mT": model.rest_mT[i].tolist(),
-                "scale_mT": float(model.scale_mT[i]),
                 "coefficients_rad": model.coefficients[i].tolist(),
             }
             for i in np.flatnonzero(model.fitted)
@@ -93,7 +92,6 @@ def from_text(text: str, where: str) -> Calibration:
         model = PolynomialModel(
             degree=degree,
             rest_mT=np.zeros((n, 3)),
-            scale_mT=np.ones(n),
             coefficients=np.zeros((n, terms, 2)),
             sigma=np.zeros(n),
             max_inclination=np.zeros(n),
@@ -102,7 +100,6 @@ def from_text(text: str, where: str) -> Calibration:
         for whisker in content["whiskers"]:
             i = int(whisker["row"]) * cols + int(whisker["col"])
             model.rest_mT[i] = whisker["rest_mT"]
-            model.scale_mT[i] = whisker["scale_mT"]
             model.coefficients[i] = whisker["coefficients_rad"]
             model.sigma[i] = np.deg2rad(whisker["sigma_deg"])
             model.max_inclination[i] = np.deg2rad(whisker["max_inclination_deg"])

@@ -8,12 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.polynomial import FloatArray, PolynomialModel, monomials, tilt_from_angles
+from calibration.polynomial import FloatArray, PolynomialModel, dipole_coordinates, monomials, tilt_from_angles
 
 DEGREES: tuple[int, ...] = (2, 3, 4, 5)
 FOLDS = 5
 #: Singular values below this share of the largest are noise: the field of a tilting magnet is a surface in space.
-RELATIVE_CUTOFF = 1e-5
+RELATIVE_CUTOFF = 1e-4
+#: Less than ten times the sensor's noise is no magnet.
+MIN_REST_FIELD_MT = 1.5
 MIN_SAMPLES = 24
 MIN_INCLINATION_RANGE = np.deg2rad(20.0)
 #: Inclination below which a sample counts as rest.
@@ -118,18 +120,17 @@ def fit_jig(samples: JigSamples, rows: int, cols: int, seed: int = 0) -> FitRepo
     members = [np.flatnonzero(place == i) for i in range(n)]
     tilt = tilt_from_angles(samples.inclination, samples.azimuth)
     rest: FloatArray = np.zeros((n, 3))
-    scale: FloatArray = np.ones(n)
     for i, member in enumerate(members):
         if len(member):
             check_coverage(samples.inclination[member], samples.azimuth[member], f"whisker ({i // cols}, {i % cols})")
             at_rest = member[samples.inclination[member] <= REST_INCLINATION]
             rest[i] = samples.field_mT[at_rest].mean(axis=0)
-            scale[i] = max(float(np.abs(samples.field_mT[member] - rest[i]).max()), 1e-3)
+            strength = float(np.linalg.norm(rest[i]))
+            if strength < MIN_REST_FIELD_MT:
+                raise FitError(f"whisker ({i // cols}, {i % cols}): {strength:.2f} mT at rest: is its magnet there?")
     rng = np.random.default_rng(seed)
     folds = [rng.permutation(len(member)) % FOLDS for member in members]
-    errors = {
-        degree: _cross_validate(samples.field_mT, tilt, members, folds, rest, scale, degree) for degree in DEGREES
-    }
+    errors = {degree: _cross_validate(samples.field_mT, tilt, members, folds, rest, degree) for degree in DEGREES}
     fitted = np.array([len(member) > 0 for member in members])
     mean_error = {d: float(np.sqrt(np.mean(e[fitted] ** 2))) for d, e in errors.items()}
     degree = min(mean_error, key=lambda d: mean_error[d])
@@ -138,10 +139,10 @@ def fit_jig(samples: JigSamples, rows: int, cols: int, seed: int = 0) -> FitRepo
     reach = np.zeros(n)
     for i, member in enumerate(members):
         if len(member):
-            u = (samples.field_mT[member] - rest[i]) / scale[i]
+            u = dipole_coordinates(samples.field_mT[member], rest[i])
             coefficients[i] = _solve(monomials(u, degree), tilt[member])
             reach[i] = samples.inclination[member].max()
-    model = PolynomialModel(degree, rest, scale, coefficients, errors[degree], reach, fitted)
+    model = PolynomialModel(degree, rest, coefficients, errors[degree], reach, fitted)
     return FitReport(model, np.array([len(member) for member in members]), mean_error)
 
 
@@ -156,7 +157,6 @@ def _cross_validate(
     members: list[NDArray[np.intp]],
     folds: list[NDArray[np.intp]],
     rest: FloatArray,
-    scale: FloatArray,
     degree: int,
 ) -> FloatArray:
     """RMS angle between held-out and predicted rod directions per whisker, shape (n,), rad."""
@@ -164,7 +164,7 @@ def _cross_validate(
     for i, (member, fold) in enumerate(zip(members, folds, strict=True)):
         if not len(member):
             continue
-        features = monomials((field[member] - rest[i]) / scale[i], degree)
+        features = monomials(dipole_coordinates(field[member], rest[i]), degree)
         squares = 0.0
         for k in range(FOLDS):
             held = fold == k

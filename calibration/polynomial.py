@@ -1,9 +1,11 @@
 """Polynomial whisker model: magnetic vector to tilt vector, for the whole array at once.
 
 The tilt vector is (phi cos a, phi sin a), rad: inclination and azimuth as one smooth quantity, with nothing special
-at zero inclination, where the azimuth means little. Each whisker has its own polynomial of total degree `degree` in
-u = (B - B_rest) / scale. Elastomer-magnet sensors are fitted with polynomials of this kind throughout the
-literature; what degree they need here is found by cross-validation (`fit.py`).
+at zero inclination, where the azimuth means little. A dipole that tilts by phi in front of the sensor makes
+B = k (-sin phi cos a, -sin phi sin a, 2 cos phi), so atan2(2 |B_xy|, B_z) along B_xy is its tilt already; what
+levers, offsets and rotations add to that is smooth, and each whisker's own polynomial of total degree `degree` in
+(dipole tilt, relative field strength) takes it out. Elastomer-magnet sensors are fitted with polynomials throughout
+the literature; what degree they need here is found by cross-validation (`fit.py`).
 """
 
 from __future__ import annotations
@@ -49,6 +51,25 @@ def monomials(u: FloatArray, degree: int) -> FloatArray:
     return np.concatenate(parts, axis=-1)
 
 
+def dipole_coordinates(field_mT: FloatArray, rest_mT: FloatArray) -> FloatArray:
+    """Tilt of an ideal dipole that makes this field (rad, two components), and the field's relative strength.
+
+    Args:
+        field_mT: shape (..., 3), mT.
+        rest_mT: field at rest, shape (..., 3), mT; its z tells which way the magnet is mounted.
+
+    Returns:
+        shape (..., 3).
+    """
+    upright = np.where(rest_mT[..., 2:] < 0.0, -1.0, 1.0) * field_mT
+    # Uncalibrated whiskers have no rest field; 1 mT keeps their values finite.
+    rest_strength = np.maximum(np.sqrt(np.sum(np.square(rest_mT), axis=-1)), 1.0)
+    transverse = np.maximum(np.hypot(upright[..., 0], upright[..., 1]), 1e-9)
+    factor = np.arctan2(2.0 * transverse, upright[..., 2]) / transverse
+    strength = np.sqrt(transverse**2 + upright[..., 2] ** 2) / rest_strength - 1.0
+    return np.stack([upright[..., 0] * factor, upright[..., 1] * factor, strength], axis=-1)
+
+
 def tilt_from_angles(inclination: FloatArray, azimuth: FloatArray) -> FloatArray:
     """Tilt vector (phi cos a, phi sin a), shape (..., 2), rad."""
     return np.stack([inclination * np.cos(azimuth), inclination * np.sin(azimuth)], axis=-1)
@@ -66,7 +87,6 @@ class PolynomialModel:
     Attributes:
         degree: total degree.
         rest_mT: field at rest, shape (n, 3), mT.
-        scale_mT: normalisation, shape (n,), mT.
         coefficients: shape (n, terms, 2), rad.
         sigma: one-sigma error of the rod's direction, shape (n,), rad.
         max_inclination: largest inclination that the fit has seen, shape (n,), rad.
@@ -75,7 +95,6 @@ class PolynomialModel:
 
     degree: int
     rest_mT: FloatArray
-    scale_mT: FloatArray
     coefficients: FloatArray
     sigma: FloatArray
     max_inclination: FloatArray
@@ -83,7 +102,7 @@ class PolynomialModel:
 
     def tilt(self, field_mT: FloatArray) -> FloatArray:
         """Tilt vectors, shape (n, 2), rad, of one field reading per whisker, shape (n, 3), mT."""
-        u = (field_mT - self.rest_mT) / self.scale_mT[:, None]
+        u = dipole_coordinates(field_mT, self.rest_mT)
         features = monomials(u, self.degree)
         tilt: FloatArray = np.matmul(features[:, None, :], self.coefficients)[:, 0, :]
         return tilt

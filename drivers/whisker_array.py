@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers import cdr
 from drivers.counters import Counters
 from drivers.measurement import HallFrame
 from drivers.ros_messages import (
@@ -36,8 +37,6 @@ WHISKER = np.dtype(
         "itemsize": 24,
     }
 )
-_STAMP = struct.Struct("<iI")
-_UINT32 = struct.Struct("<I")
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,28 +51,18 @@ class WhiskerArray:
     whiskers: NDArray[np.void]
 
 
-def _align4(size: int) -> int:
-    return (size + 3) & ~3
-
-
 def encode(message: WhiskerArray) -> bytes:
     """The message as little-endian CDR, byte for byte as a general serialiser writes it."""
-    sec, nanosec = divmod(message.stamp_ns, NANOSECONDS_PER_SECOND)
-    body = bytearray(_STAMP.pack(sec, nanosec))
-    _append_string(body, message.frame_id)
+    body = cdr.stamp(message.stamp_ns)
+    body += cdr.string(message.frame_id, len(body))
     body += bytes((message.num_mux, message.num_sensors))
-    _append_string(body, message.representation)
-    body += bytes(_align4(len(body)) - len(body)) + _UINT32.pack(len(message.whiskers))
+    body += cdr.string(message.representation, len(body))
+    body += cdr.padding(len(body), 4) + cdr.UINT32.pack(len(message.whiskers))
     # A fresh zeroed array, so that padding never carries what was in memory before.
     records = np.zeros(len(message.whiskers), dtype=WHISKER)
     for name in WHISKER.names or ():
         records[name] = message.whiskers[name]
-    return CDR_LITTLE_ENDIAN + bytes(body) + records.tobytes()
-
-
-def _append_string(body: bytearray, text: str) -> None:
-    encoded = text.encode() + b"\0"
-    body += bytes(_align4(len(body)) - len(body)) + _UINT32.pack(len(encoded)) + encoded
+    return CDR_LITTLE_ENDIAN + body + records.tobytes()
 
 
 def decode(data: bytes) -> WhiskerArray:
@@ -86,15 +75,15 @@ def decode(data: bytes) -> WhiskerArray:
         return _decode_general(data)
     body = memoryview(data)[4:]
     try:
-        sec, nanosec = _STAMP.unpack_from(body)
-        frame_id, at = _read_string(body, _STAMP.size)
+        sec, nanosec = cdr.STAMP.unpack_from(body)
+        frame_id, at = _read_string(body, cdr.STAMP.size)
         num_mux, num_sensors = body[at], body[at + 1]
         representation, at = _read_string(body, at + 2)
-        at = _align4(at)
-        (count,) = _UINT32.unpack_from(body, at)
+        at = cdr.align(at, 4)
+        (count,) = cdr.UINT32.unpack_from(body, at)
     except (struct.error, IndexError, UnicodeDecodeError) as error:
         raise MessageError(f"not a message of type {TYPENAME}: {error}") from error
-    at += _UINT32.size
+    at += cdr.UINT32.size
     surplus = len(body) - at - count * WHISKER.itemsize
     if not 0 <= surplus <= 3:
         raise MessageError(f"not a message of type {TYPENAME}: {count} whiskers do not fit {len(data)} bytes")
@@ -104,12 +93,12 @@ def decode(data: bytes) -> WhiskerArray:
 
 
 def _read_string(body: memoryview, at: int) -> tuple[str, int]:
-    at = _align4(at)
-    (length,) = _UINT32.unpack_from(body, at)
-    end = at + _UINT32.size + length
+    at = cdr.align(at, 4)
+    (length,) = cdr.UINT32.unpack_from(body, at)
+    end = at + cdr.UINT32.size + length
     if length == 0 or end > len(body):
         raise IndexError(f"a string of {length} bytes at {at}")
-    return bytes(body[at + _UINT32.size : end - 1]).decode(), end
+    return bytes(body[at + cdr.UINT32.size : end - 1]).decode(), end
 
 
 def _decode_general(data: bytes) -> WhiskerArray:

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from calibration.angle_estimator import AngleEstimator
 from calibration.polynomial import PolynomialModel
-from robominer_slam.configuration.model import Configuration, EstimationSection
+from robominer_slam.configuration.model import Configuration
 from robominer_slam.contacts import ContactModel
-from robominer_slam.estimation.fused_odometry import FilterNoise, FusedOdometry
+from robominer_slam.estimation.fused_odometry import FusedOdometry
 from robominer_slam.estimation.integrated_odometry import IntegratedOdometry
 from robominer_slam.estimation.odometry_state import DeadReckoning
 from robominer_slam.estimation.screw_kinematics import forward_matrix
@@ -29,18 +29,7 @@ def build_pipeline(
     configuration: Configuration, layout: WhiskerLayout, model: PolynomialModel, execution: Execution
 ) -> Pipeline:
     """Assemble the pipeline; `threaded` for the daemon, `synchronous` for replay."""
-    composite: CompositeScan | None = None
-    runner: BackendRunner | None = None
-    slam = configuration.slam
-    if slam.method == "thesis":
-        thesis = slam.thesis
-        composite = CompositeScan(thesis.keyframe_distance, thesis.keyframe_angle, thesis.scan_voxel)
-        backend = ThesisBackend(thesis)
-        latency_ns = round(slam.backend_latency * 1e9)
-        if execution == "threaded":
-            runner = ThreadedRunner(backend, latency_ns, slam.backend_queue)
-        else:
-            runner = SynchronousRunner(backend, latency_ns)
+    composite, runner = build_slam(configuration, execution)
     contact = configuration.contact
     return Pipeline(
         dead_reckoning=_dead_reckoning(configuration),
@@ -59,26 +48,26 @@ def build_pipeline(
     )
 
 
+def build_slam(configuration: Configuration, execution: Execution) -> tuple[CompositeScan | None, BackendRunner | None]:
+    """The method's front-end and back-end, fresh; nothing for odometry alone."""
+    slam = configuration.slam
+    if slam.method == "none":
+        return None, None
+    thesis = slam.thesis
+    composite = CompositeScan(thesis.keyframe_distance, thesis.keyframe_angle, thesis.scan_voxel)
+    backend = ThesisBackend(thesis)
+    latency_ns = round(slam.backend_latency * 1e9)
+    if execution == "threaded":
+        return composite, ThreadedRunner(backend, latency_ns, slam.backend_queue)
+    return composite, SynchronousRunner(backend, latency_ns)
+
+
 def _dead_reckoning(configuration: Configuration) -> DeadReckoning:
     if configuration.estimation.source == "odometry":
         return IntegratedOdometry()
     screws = configuration.screws
     matrix = forward_matrix(screws.radius, np.deg2rad(screws.helix_angle_deg), screws.half_track, screws.half_base)
-    return FusedOdometry(filter_noise(configuration.estimation), matrix)
-
-
-def filter_noise(estimation: EstimationSection) -> FilterNoise:
-    """The filter's noise from the configuration."""
-    return FilterNoise(
-        screws=(estimation.sigma_screws_vx, estimation.sigma_screws_vy, estimation.sigma_screws_wz),
-        gyro=estimation.sigma_gyro,
-        gyro_bias_start=estimation.sigma_gyro_bias_start,
-        gyro_bias_walk=estimation.gyro_bias_walk,
-        acceleration_walk=estimation.acceleration_walk,
-        angular_acceleration_walk=estimation.angular_acceleration_walk,
-        position_walk=estimation.position_walk,
-        still_screw_speed=estimation.still_screw_speed,
-    )
+    return FusedOdometry(configuration.estimation, matrix)
 
 
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> FloatArray:

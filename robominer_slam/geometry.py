@@ -83,6 +83,7 @@ __all__ = [
     "so3_left_jacobian",
     "so3_left_jacobian_inverse",
     "so3_log",
+    "squared_norm",
     "to_vector7",
     "transform_points",
     "wrap_angle",

@@ -138,8 +138,8 @@ def to_json(layout: WhiskerLayout) -> str:
             "cols": layout.cols,
             "whiskers": [
                 {
-                    "row": i // layout.cols,
-                    "col": i % layout.cols,
+                    "row": int(i // layout.cols),
+                    "col": int(i % layout.cols),
                     "position_m": layout.p_base[i].tolist(),
                     "rotation": layout.R_base_whisker[i].tolist(),
                     "length_m": float(layout.length[i]),

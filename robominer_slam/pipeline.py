@@ -85,6 +85,15 @@ class Pipeline:
         T_odom_base = planar_pose(self._dead_reckoning.state_at(stamp))
         self._T_map_odom = planar(x, y, yaw) @ geometry.inverse(T_odom_base)
 
+    def start_new_map(self, composite_scan: CompositeScan | None, runner: BackendRunner | None) -> None:
+        """Begin anew with an empty map whose frame is odom; what the former back-end still computes is dropped."""
+        if self.runner is not None:
+            self.runner.close()
+        self._composite, self.runner = composite_scan, runner
+        self._T_map_odom = np.eye(4)
+        self._last_result = self._odometry_at_result = None
+        self._odometry_of_keyframe.clear()
+
     def _process(self, due: list[tuple[str, Measurement]]) -> list[FrameResult]:
         results = []
         for device, measurement in due:

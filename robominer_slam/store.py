@@ -115,6 +115,7 @@ class MapStore:
 
     def __init__(self, path: Path, sync_s: float, robot: str, name: str) -> None:
         self._connection = open_database(path)
+        self._lock = threading.Lock()
         self._sync_s = sync_s
         self._queue: queue.Queue[tuple[BackendResult, int] | None] = queue.Queue(QUEUE_LENGTH)
         self.map_id = self._start_map(robot, name)
@@ -153,6 +154,12 @@ class MapStore:
         with self._lock:
             self._connection.execute("UPDATE maps SET name = ? WHERE id = ?", (name, self.map_id))
 
+    def new_map(self, robot: str, name: str) -> None:
+        """What is added from now on belongs to a new map."""
+        self.flush(self._sync_s * 2)
+        with self._lock:
+            self.map_id = self._start_map(robot, name)
+
     def flush(self, timeout_s: float) -> bool:
         """Wait until what was added so far is on the disk; False if it took longer."""
         end = time.monotonic() + timeout_s
@@ -163,7 +170,6 @@ class MapStore:
         return True
 
     def _start_map(self, robot: str, name: str) -> int:
-        self._lock = threading.Lock()
         cursor = self._connection.execute(
             "INSERT INTO maps (name, created_unix_ns, robot) VALUES (?, ?, ?)", (name, time.time_ns(), robot)
         )

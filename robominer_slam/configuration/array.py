@@ -6,6 +6,7 @@ from pathlib import Path
 
 from calibration.file_format import Calibration, check_fits, from_text
 from robominer_slam import layout as layouts
+from robominer_slam.calibrated_array import CalibratedArray
 from robominer_slam.configuration.file import ConfigurationError
 from robominer_slam.configuration.model import Configuration
 from robominer_slam.layout import LayoutError, WhiskerLayout
@@ -63,3 +64,20 @@ def read_calibration(path: Path, layout: WhiskerLayout) -> Calibration:
             f"{path}: the calibration cannot be read ({error}); make one with 'robominer-slam calibrate fit'"
         ) from error
     return load_calibration(text, str(path), layout)
+
+
+def calibrated_array(configuration: Configuration, folder: Path) -> CalibratedArray:
+    """The configured layout with the calibration of the device that carries the whiskers.
+
+    Raises:
+        ConfigurationError: no device names a calibration, or it cannot be read.
+        LayoutError, CalibrationFileError: it cannot be used.
+    """
+    layout = load_layout(configuration.robot.layout, folder)
+    path = calibration_path(configuration, folder)
+    if path is None:
+        raise ConfigurationError(
+            "device: expected calibration = 'FILE.json' on the [[device]] that carries the whiskers; "
+            "make one with 'robominer-slam calibrate fit'"
+        )
+    return CalibratedArray(layout, read_calibration(path, layout).model)

@@ -8,13 +8,12 @@ The body is taken as level.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
 
 from drivers.measurement import ImuSample, Measurement, ScrewAngles, ScrewSpeeds
+from robominer_slam.configuration.model import EstimationSection
 from robominer_slam.estimation.odometry_state import OdometryState
 
 FloatArray = NDArray[np.float64]
@@ -23,26 +22,13 @@ X, Y, YAW, VX, VY, WZ, BIAS = range(7)
 STATE = 7
 #: A gap in the screws' readings longer than this has no meaningful mean speed.
 MAX_SCREW_INTERVAL_S = 0.5
+#: Deviation of the velocity, m/s and rad/s, of a robot whose screws stand still: it may creep.
+STILL_SIGMA = 0.002
 
 H_GYRO = np.zeros((1, STATE))
 H_GYRO[0, [WZ, BIAS]] = 1.0
 H_VELOCITY = np.zeros((3, STATE))
 H_VELOCITY[[0, 1, 2], [VX, VY, WZ]] = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class FilterNoise:
-    """Noise of the filter; the configuration's `[estimation]` gives values, units and reasons."""
-
-    screws: tuple[float, float, float]
-    gyro: float
-    gyro_bias_start: float
-    gyro_bias_walk: float
-    acceleration_walk: float
-    angular_acceleration_walk: float
-    position_walk: float
-    still_screw_speed: float
-    still_velocity: tuple[float, float, float] = (0.002, 0.002, 0.002)
 
 
 def motion(state: FloatArray, dt: float) -> FloatArray:
@@ -92,21 +78,21 @@ class FusedOdometry:
     """Fuses IMU (gyro) and screws; measurements come in the order of their stamps.
 
     Args:
-        noise: see `FilterNoise`.
+        noise: the filter's noise, with units and reasons there.
         screw_matrix: from `screw_kinematics.forward_matrix`, shape (4, 4).
     """
 
-    def __init__(self, noise: FilterNoise, screw_matrix: FloatArray) -> None:
+    def __init__(self, noise: EstimationSection, screw_matrix: FloatArray) -> None:
         self._noise = noise
         self._screw_matrix = screw_matrix
         self._filter = _PlanarFilter(dim_x=STATE, dim_z=3)
         self._filter.x = np.zeros(STATE)
-        self._filter.P = np.diag([0.0, 0.0, 0.0, 1e-4, 1e-4, 1e-4, noise.gyro_bias_start**2])
+        self._filter.P = np.diag([0.0, 0.0, 0.0, 1e-4, 1e-4, 1e-4, noise.sigma_gyro_bias_start**2])
         self._stamp_ns: int | None = None
         self._screws: ScrewAngles | None = None
-        self._R_gyro = np.array([[noise.gyro**2]])
-        self._R_screws = np.diag(np.square(noise.screws))
-        self._R_still = np.diag(np.square(noise.still_velocity))
+        self._R_gyro = np.array([[noise.sigma_gyro**2]])
+        self._R_screws = np.diag(np.square([noise.sigma_screws_vx, noise.sigma_screws_vy, noise.sigma_screws_wz]))
+        self._R_still = np.eye(3) * STILL_SIGMA**2
         self.stale = 0
 
     def add(self, measurement: Measurement) -> None:

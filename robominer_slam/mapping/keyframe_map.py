@@ -50,6 +50,13 @@ class KeyframeMap:
         self.version += 1
         return keyframe
 
+    def clear(self) -> None:
+        """Start anew; the version goes on, so that nobody takes the new map for the old one."""
+        self.keyframes = []
+        self.poses = np.zeros((0, 4, 4))
+        self.edges = ()
+        self.version += 1
+
     @property
     def closures(self) -> int:
         """Number of loop closures in the graph."""

@@ -7,7 +7,8 @@ and serves every iteration until nodes or edges are added.
 
 The order comes from SuperLU's minimum degree on the graph of nodes, which is d^2 times smaller than the matrix of
 scalars; the factorisations then keep it. Symmetric mode with diagonal pivots suits positive definite matrices and
-keeps the fill of that order: with SuperLU's default order 3D graphs take a hundred times longer.
+keeps the fill of that order: with SuperLU's default order 3D graphs take a hundred times longer. Leave its
+`relax` at the default: 16 or more overruns a buffer inside SuperLU and corrupts the heap (seen with scipy 1.17).
 """
 
 from __future__ import annotations
@@ -80,17 +81,18 @@ class SystemPattern:
         by_column = np.lexsort((row, column))
         row, column, block = row[by_column], column[by_column], block[by_column]
         per_column = np.bincount(column, minlength=f)
-        first = np.concatenate([[0], np.cumsum(per_column)[:-1]])
+        first = np.cumsum(per_column) - per_column
         # Column c of a block column lists, for each of its blocks in turn, that block's d rows.
         c, r = np.arange(d)[:, None], np.arange(d)
         start = first[column] * d * d + (np.arange(row.size) - first[column]) * d
         slot = start[:, None, None] + (c * per_column[column][:, None, None]) * d + r
         self._source = np.empty(row.size * d * d, dtype=np.int64)
         self._source[slot] = block[:, None, None] * d * d + r * d + c
-        self._indices = np.empty(self._source.size, dtype=np.int32)
-        self._indices[slot] = row[:, None, None] * d + r
-        self._indptr = np.concatenate([[0], np.cumsum(np.repeat(per_column * d, d))]).astype(np.int32)
-        self._blocks = f + keys.size
+        indices = np.empty(self._source.size, dtype=np.int32)
+        indices[slot] = row[:, None, None] * d + r
+        indptr = np.concatenate([[0], np.cumsum(np.repeat(per_column * d, d))]).astype(np.int32)
+        self._H = csc_matrix((np.zeros(indices.size), indices, indptr), shape=(f * d, f * d))
+        self._H.has_sorted_indices = True
 
     def gradient(self, edge_gradients: FloatArray) -> FloatArray:
         """Sum of the edges' gradients J_j' Omega e, shape (m, d), over the free nodes, shape (f, d)."""
@@ -101,24 +103,15 @@ class SystemPattern:
         d = self.block_size
         return np.asarray(self._blocks_of_edges @ edge_blocks.reshape(-1, d * d)).reshape(-1, d, d)
 
-    def factorise(self, hessian_blocks: FloatArray, damping: float = 0.0) -> SuperLU:
-        """LU factors of H with every diagonal block multiplied by 1 + damping.
-
-        Damping by the node's own block makes the step independent of the units and of the point about which
-        poses are perturbed.
+    def factorise(self, hessian_blocks: FloatArray) -> SuperLU:
+        """LU factors of H. Use them in this thread only, and let go of them soon: SuperLU frees per thread.
 
         Raises:
             SingularSystemError: the matrix is singular.
         """
-        size = self.free_nodes.size * self.block_size
-        values = hessian_blocks.reshape(-1)
-        if damping > 0.0:
-            values = values.copy()
-            values[: self.free_nodes.size * self.block_size**2] *= 1.0 + damping
-        H = csc_matrix((values[self._source], self._indices, self._indptr), shape=(size, size))
-        H.has_sorted_indices = True
+        np.take(hessian_blocks.reshape(-1), self._source, out=self._H.data)
         try:
-            return splu(H, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=_SYMMETRIC)
+            return splu(self._H, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=_SYMMETRIC)
         except RuntimeError as error:  # SuperLU: "Factor is exactly singular"
             raise SingularSystemError(str(error)) from error
 
@@ -145,6 +138,8 @@ def _signed_selection(
 
 def _elimination_order(a: NDArray[np.int64], b: NDArray[np.int64], f: int) -> NDArray[np.int64]:
     """Free nodes in an order of little fill: minimum degree on the graph whose edges are (a, b); -1 is fixed."""
+    if f == 0:
+        return np.empty(0, dtype=np.int64)
     both = (a >= 0) & (b >= 0)
     a, b, k = a[both], b[both], np.arange(f)
     degree = 1.0 + np.bincount(a, minlength=f) + np.bincount(b, minlength=f)

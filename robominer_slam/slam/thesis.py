@@ -16,8 +16,9 @@ from robominer_slam import geometry
 from robominer_slam.configuration.model import ThesisSection
 from robominer_slam.slam.fitness_information import information_from_fitness
 from robominer_slam.slam.keyframe import BackendResult, GraphEdge, Keyframe
-from robominer_slam.slam.pose_graph import PoseGraph
+from robominer_slam.slam.pose_graph import EdgeKind, PoseGraph
 from robominer_slam.slam.registration import Match, ScanTarget, fitness, register
+from robominer_slam.slam.robust_kernels import KernelName
 
 FloatArray = NDArray[np.float64]
 
@@ -79,12 +80,11 @@ class ThesisBackend:
         self._targets.append(target)
         self._poses = np.concatenate([self._poses, T_map_new[None]])
 
-    def _add_edge(self, kind: str, i: int, T_i_new: FloatArray, information: FloatArray) -> None:
+    def _add_edge(self, kind: EdgeKind, i: int, T_i_new: FloatArray, information: FloatArray) -> None:
         j = len(self._keyframes) - 1
-        kernel = "none" if kind == "odometry" else self._parameters.kernel
-        edge_kind: str = kind
-        self._graph.add_edge(i, j, T_i_new, information, kind=edge_kind, kernel=kernel, kernel_width=KERNEL_WIDTH)
-        self._edges.append(GraphEdge("loop" if kind == "loop" else "odometry", i, j, T_i_new, information, 1.0))
+        kernel: KernelName = "none" if kind == "odometry" else self._parameters.kernel
+        self._graph.add_edge(i, j, T_i_new, information, kind=kind, kernel=kernel, kernel_width=KERNEL_WIDTH)
+        self._edges.append(GraphEdge(kind, i, j, T_i_new, information, 1.0))
 
     def _odometry_information(self, T_last_new: FloatArray) -> FloatArray:
         """As hdl_graph_slam: from the fitness of neighbouring scans laid upon each other by odometry."""
@@ -125,6 +125,8 @@ class ThesisBackend:
 
     def _covariance(self) -> FloatArray:
         """Of the newest keyframe's (x, y, yaw) in map, shape (3, 3)."""
+        if len(self._keyframes) == 1:
+            return np.zeros((3, 3))
         covariance = self._graph.marginal_covariance([len(self._keyframes) - 1])[0]
         pick = [0, 1, 5]
         # The graph's tangent space is the keyframe's own frame; published is the map frame.

@@ -1,0 +1,43 @@
+# Everything runs in .venv, made on first use from Python 3.11 or newer.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+
+.PHONY: demo test lint types bench clean venv
+.DEFAULT_GOAL := help
+
+help:
+	@echo "make demo    simulated robot + daemon + report, about three minutes"
+	@echo "make test    lint, types and tests, under eight minutes"
+	@echo "make bench   accuracy and speed tables (long)"
+
+$(VENV)/.sim: pyproject.toml
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet -e '.[sim,operator]'
+	touch $@
+
+$(VENV)/.dev: $(VENV)/.sim
+	$(BIN)/python -m pip install --quiet -e '.[sim,operator,dev]'
+	touch $@
+
+venv: $(VENV)/.dev
+
+demo: $(VENV)/.sim
+	$(BIN)/robominer-slam demo --out out
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(VENV)/.dev
+	$(BIN)/mypy
+
+test: lint types
+	$(BIN)/python -m pytest
+
+bench: $(VENV)/.dev
+	$(BIN)/python benchmarks/pose_graph.py
+
+clean:
+	rm -rf $(VENV) out build dist .mypy_cache .ruff_cache .pytest_cache

@@ -1,0 +1,125 @@
+"""`robominer-slam graph`: the pose-graph back-end on its own, on files in g2o's format."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import click
+from rich.console import Console
+from rich.table import Table
+
+from robominer_slam.slam.g2o_format import G2oFormatError, G2oGraph, format_g2o, parse_g2o
+from robominer_slam.slam.pose_graph import OptimizationResult, PoseGraph, PoseGraphError
+from robominer_slam.slam.pose_graph_optimizer import OptimizationOptions
+from robominer_slam.slam.pose_graph_residuals import Convention
+
+CONVENTIONS: tuple[Convention, ...] = ("gtsam", "g2o")
+_MEANING = {"gtsam": "full SE(n) log (GTSAM)", "g2o": "t and theta or q_vec (g2o)"}
+
+
+@click.group()
+def graph() -> None:
+    """Pose graphs in g2o's text format."""
+
+
+def read_g2o(path: Path) -> G2oGraph:
+    """Read a file; a user's mistake in it becomes a usage error that names file and line."""
+    try:
+        return parse_g2o(path.read_text(encoding="utf-8"), str(path))
+    except UnicodeDecodeError as error:
+        raise click.UsageError(
+            f"{path}: not a text file ({error.reason}); expected a pose graph in g2o's format"
+        ) from error
+    except G2oFormatError as error:
+        raise click.UsageError(str(error)) from error
+
+
+def pose_graph_of(content: G2oGraph, path: Path) -> PoseGraph:
+    """Pose graph of a file's content; what cannot be solved becomes a usage error that names the file."""
+    try:
+        pose_graph = PoseGraph(content.dim)
+        pose_graph.add_nodes(content.poses)
+        pose_graph.add_edges(content.i, content.j, content.measurements, content.information)
+        if content.fixed:
+            pose_graph.fix(content.fixed)
+    except PoseGraphError as error:
+        raise click.UsageError(f"{path}: {error} (nodes and edges counted from 0 in the file's order)") from error
+    return pose_graph
+
+
+@graph.command(epilog="Example: robominer-slam graph optimize intel.g2o --out intel-optimized.g2o --json")
+@click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.option(
+    "--out", type=click.Path(dir_okay=False, path_type=Path), help="Where to write the optimized graph, 17 digits."
+)
+@click.option(
+    "--convention",
+    type=click.Choice(CONVENTIONS),
+    default="gtsam",
+    show_default=True,
+    help="Error to minimise: gtsam is the full SE(n) logarithm; g2o is (t, theta) or (t, q_vec).",
+)
+@click.option(
+    "--max-iterations", type=click.IntRange(min=1), default=100, show_default=True, help="Linear solves at most."
+)
+@click.option("--json", "as_json", is_flag=True, help="Print the figures as JSON.")
+def optimize(file: Path, out: Path | None, convention: Convention, max_iterations: int, as_json: bool) -> None:
+    """Optimize the pose graph in FILE (g2o format).
+
+    The first node stays where it is, or those that FIX lines name. chi2 is the sum of e' Omega e over all edges.
+    """
+    content = read_g2o(file)
+    pose_graph = pose_graph_of(content, file)
+    before = {name: pose_graph.chi2(name) for name in CONVENTIONS}
+    try:
+        result = pose_graph.optimize(OptimizationOptions(convention=convention, max_iterations=max_iterations))
+    except PoseGraphError as error:
+        raise click.UsageError(f"{file}: {error} (nodes and edges counted from 0 in the file's order)") from error
+    after = {name: pose_graph.chi2(name) for name in CONVENTIONS}
+    if out is not None:
+        try:
+            out.write_text(format_g2o(replace(content, poses=pose_graph.poses)), encoding="utf-8")
+        except OSError as error:
+            raise click.UsageError(f"{out}: cannot be written ({error.strerror})") from error
+    if as_json:
+        figures = {
+            "file": str(file),
+            "out": None if out is None else str(out),
+            "dimension": content.dim,
+            "nodes": pose_graph.node_count,
+            "edges": pose_graph.edge_count,
+            "convention": convention,
+            "chi2_before": before,
+            "chi2_after": after,
+            "iterations": result.iterations,
+            "converged": result.converged,
+            "seconds": result.seconds,
+        }
+        click.echo(json.dumps(figures))
+    else:
+        _print_table(pose_graph, convention, before, after, result)
+    if not result.converged:
+        raise click.ClickException(
+            f"{file}: not converged after {result.iterations} iterations; raise --max-iterations or start nearer"
+        )
+
+
+def _print_table(
+    pose_graph: PoseGraph,
+    convention: Convention,
+    before: dict[Convention, float],
+    after: dict[Convention, float],
+    result: OptimizationResult,
+) -> None:
+    table = Table(title=f"{pose_graph.node_count} poses, {pose_graph.edge_count} edges, {pose_graph.dim}D")
+    table.add_column("chi2")
+    table.add_column("before", justify="right")
+    table.add_column("after", justify="right")
+    for name in CONVENTIONS:
+        minimised = ", minimised" if name == convention else ""
+        table.add_row(_MEANING[name] + minimised, f"{before[name]:.9g}", f"{after[name]:.9g}")
+    console = Console()
+    console.print(table)
+    console.print(f"{result.iterations} iterations, {result.seconds * 1e3:.1f} ms", highlight=False)

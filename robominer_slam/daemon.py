@@ -1,0 +1,154 @@
+"""The daemon: measurements in, poses and map out. The main loop; everything else hangs on it.
+
+Threads: `drivers` (serial ports), this main loop, `backend` (loop search and optimisation), `store` (disk), and
+Zenoh's own, which run the answers to queries under the state's lock.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+
+from robominer_slam import status_report
+from robominer_slam.assembly import build_pipeline, build_slam
+from robominer_slam.calibrated_array import CalibratedArray
+from robominer_slam.commands import Commands
+from robominer_slam.configuration.model import Configuration
+from robominer_slam.frame_result import FrameResult
+from robominer_slam.map_service import MapService
+from robominer_slam.mapping.keyframe_map import KeyframeMap
+from robominer_slam.publisher import Publisher
+from robominer_slam.publishing import report_messages
+from robominer_slam.publishing.bus_messages import Query, Reply
+from robominer_slam.publishing.report_messages import Diagnostic
+from robominer_slam.publishing.telemetry import encode_frame
+from robominer_slam.publishing.zenoh_session import ZenohBus
+from robominer_slam.sources.source import MeasurementSource
+from robominer_slam.store import MapStore
+from robominer_slam.wall_clock import WallClock
+
+log = logging.getLogger(__name__)
+
+STATUS_INTERVAL_NS = 1_000_000_000
+TELEMETRY_INTERVAL_NS = 250_000_000
+#: How long the loop waits for a measurement before it looks whether it should end.
+WAIT_S = 0.1
+
+
+class Daemon:
+    """Wires a source of measurements to the pipeline, and the pipeline to bus and store."""
+
+    def __init__(
+        self,
+        configuration: Configuration,
+        array: CalibratedArray,
+        source: MeasurementSource,
+        bus: ZenohBus,
+        store: MapStore,
+    ) -> None:
+        self._configuration = configuration
+        self._layout = array.layout
+        self._source = source
+        self._bus = bus
+        self._store = store
+        self._lock = threading.Lock()
+        self._clock = WallClock()
+        self._pipeline = build_pipeline(configuration, array.layout, array.model, "threaded")
+        self._map = KeyframeMap(configuration.map.point_voxel)
+        section = configuration.map
+        self._publisher = Publisher(bus, self._clock, array.layout)
+        self._map_service = MapService(bus, self._clock, self._map, section.grid_cell, section.obstacle_height)
+        self._commands = Commands(self._pipeline, self._map, store, self._new_map)
+        self._last_frame: FrameResult | None = None
+        self._telemetry_ns = self._status_ns = 0
+        self._declare_queries()
+
+    def run(self, stop: threading.Event) -> None:
+        """Work until `stop` is set; then finish what was begun and keep it.
+
+        Raises:
+            RuntimeError: a thread of ours has failed.
+        """
+        try:
+            while not stop.is_set():
+                item = self._source.get(WAIT_S)
+                with self._lock:
+                    if item is not None:
+                        for result in self._pipeline.add(*item):
+                            self._frame(result)
+                    self._status()
+        finally:
+            self._finish()
+
+    def _frame(self, result: FrameResult) -> None:
+        for backend_result in result.backend_results:
+            self._store.add(backend_result, self._clock.offset_ns)
+        self._map_service.frame(result)
+        self._publisher.frame(result)
+        if result.stamp_ns - self._telemetry_ns >= TELEMETRY_INTERVAL_NS:
+            self._telemetry_ns = result.stamp_ns
+            self._bus.put("telemetry", encode_frame(self._clock.unix_ns(result.stamp_ns), result))
+        if self._last_frame is None:
+            log.info("first whisker frame: publishing poses under %s", self._bus.prefix)
+        self._last_frame = result
+
+    def _status(self) -> None:
+        now = time.monotonic_ns()
+        if now - self._status_ns < STATUS_INTERVAL_NS:
+            return
+        self._status_ns = now
+        stamp = self._clock.unix_ns(now)
+        self._bus.put("status", report_messages.diagnostics(stamp, self._diagnostics(now)))
+
+    def _diagnostics(self, now_ns: int) -> list[Diagnostic]:
+        frame = self._last_frame
+        age_s = (now_ns - frame.stamp_ns) * 1e-9 if frame is not None else 0.0
+        entries = [
+            status_report.slam_diagnostic(frame, age_s, self._pipeline, self._map, self._map_service.digest),
+            status_report.process_diagnostic(self._clock, self._source.dropped),
+            status_report.store_diagnostic(self._store),
+            *(status_report.device_diagnostic(device) for device in self._source.status()),
+        ]
+        if frame is not None:
+            entries.append(status_report.whiskers_diagnostic(frame, self._layout.cols))
+        return entries
+
+    def _finish(self) -> None:
+        with self._lock:
+            runner = self._pipeline.runner
+            if runner is not None:
+                for result in runner.close():
+                    self._map_service.take(result)
+                    self._store.add(result, self._clock.offset_ns)
+        if self._store.flush(10.0):
+            self._store.save_poses(self._map.poses)
+        log.info(
+            "ended after %d frames: %d keyframes, %d loop closures, %d keyframes stored",
+            self._publisher.frames, len(self._map.keyframes), self._map.closures, self._store.written,
+        )  # fmt: skip
+
+    def _new_map(self) -> None:
+        self._store.new_map(self._configuration.robot.id, "")
+        self._pipeline.start_new_map(*build_slam(self._configuration, "threaded"))
+        self._map_service.new_map()
+
+    def _declare_queries(self) -> None:
+        service = self._map_service
+        handlers: dict[str, Callable[[Query], list[Reply]]] = {
+            "map/snapshot": lambda _: service.snapshot(),
+            "map/cloud": lambda _: service.cloud(),
+            "map/grid": lambda _: service.grid(),
+            "map/graph": lambda _: service.graph(),
+            "cmd/*": self._commands.handle,
+        }
+        for key, handler in handlers.items():
+            self._bus.queryable(key, self._locked(handler))
+
+    def _locked(self, handler: Callable[[Query], list[Reply]]) -> Callable[[Query], list[Reply]]:
+        def answer(query: Query) -> list[Reply]:
+            with self._lock:
+                return handler(query)
+
+        return answer

@@ -1,0 +1,100 @@
+"""The map on the bus: what changed, the path, and the answers to queries about it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from robominer_slam import geometry
+from robominer_slam.frame_result import FrameResult
+from robominer_slam.graph_json import graph_json
+from robominer_slam.mapping.height_grid import GridSizeError, height_grid, occupancy
+from robominer_slam.mapping.keyframe_map import KeyframeMap
+from robominer_slam.publisher import MAP
+from robominer_slam.publishing import cloud_messages, pose_messages, report_messages
+from robominer_slam.publishing.bus_messages import QueryRefusedError, Reply
+from robominer_slam.publishing.map_stream import MapStreamEncoder
+from robominer_slam.publishing.zenoh_session import ZenohBus
+from robominer_slam.slam.keyframe import BackendResult
+from robominer_slam.wall_clock import WallClock
+
+PATH_INTERVAL_NS = 1_000_000_000
+
+
+class MapService:
+    """Publishes the map's changes and answers queries; the caller holds the state's lock.
+
+    Args:
+        bus: to publish on.
+        clock: for stamps.
+        keyframe_map: the map; this is the only place that changes it.
+        grid_cell: of the occupancy grid, m.
+        obstacle_height: see `height_grid.occupancy`, m.
+    """
+
+    def __init__(
+        self, bus: ZenohBus, clock: WallClock, keyframe_map: KeyframeMap, grid_cell: float, obstacle_height: float
+    ) -> None:
+        self.keyframe_map = keyframe_map
+        self._bus = bus
+        self._clock = clock
+        self._grid_cell = grid_cell
+        self._obstacle_height = obstacle_height
+        self._stream = MapStreamEncoder()
+        self._path_ns: int | None = None
+        self._path_version = 0
+
+    def frame(self, result: FrameResult) -> None:
+        """Take what the back-end found, and publish what changed."""
+        for backend_result in result.backend_results:
+            self.take(backend_result)
+        if result.backend_results:
+            self._stream.set_poses(geometry.to_vector7(self.keyframe_map.poses))
+            for message in self._stream.updates():
+                self._bus.put("map/updates", message)
+        due = self._path_ns is None or result.stamp_ns - self._path_ns >= PATH_INTERVAL_NS
+        if due and self._path_version != self.keyframe_map.version:
+            self._path_ns = result.stamp_ns
+            self._path_version = self.keyframe_map.version
+            self._bus.put("path", self.path(self._clock.unix_ns(result.stamp_ns)))
+
+    def take(self, result: BackendResult) -> None:
+        """Take a keyframe into the map without publishing it yet."""
+        keyframe = self.keyframe_map.take(result)
+        self._stream.add_keyframe(keyframe.id, self._clock.unix_ns(keyframe.stamp_ns), keyframe.points)
+
+    def new_map(self) -> None:
+        """Start anew with an empty map."""
+        self.keyframe_map.clear()
+        self._stream = MapStreamEncoder()
+
+    @property
+    def digest(self) -> str:
+        """Digest of the map as the stream carries it."""
+        return self._stream.digest()
+
+    def path(self, stamp_ns: int) -> bytes:
+        """nav_msgs/Path of the keyframes."""
+        stamps = [self._clock.unix_ns(k.stamp_ns) for k in self.keyframe_map.keyframes]
+        return pose_messages.path(stamp_ns, MAP, stamps, geometry.to_vector7(self.keyframe_map.poses))
+
+    def snapshot(self) -> list[Reply]:
+        """The whole stream state, in messages of a few KB."""
+        return [Reply(message) for message in self._stream.snapshot()]
+
+    def cloud(self) -> list[Reply]:
+        """PointCloud2 of the map."""
+        return [Reply(cloud_messages.map_cloud(self._clock.now_unix_ns(), MAP, self.keyframe_map.cloud()))]
+
+    def grid(self) -> list[Reply]:
+        """OccupancyGrid: steps as obstacles."""
+        try:
+            grid = height_grid(self.keyframe_map.cloud(), self._grid_cell)
+        except GridSizeError as error:
+            raise QueryRefusedError(str(error)) from error
+        cells = np.ascontiguousarray(occupancy(grid, self._obstacle_height))
+        message = report_messages.occupancy_grid(self._clock.now_unix_ns(), MAP, grid.cell, grid.origin, cells)
+        return [Reply(message)]
+
+    def graph(self) -> list[Reply]:
+        """The pose graph as JSON."""
+        return [Reply(graph_json(self.keyframe_map, self._clock.offset_ns).encode())]

@@ -1,0 +1,90 @@
+"""Each frame's result onto the bus: pose, odometry, transforms, contacts, telemetry."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robominer_slam import geometry
+from robominer_slam.frame_result import FrameResult
+from robominer_slam.layout import WhiskerLayout
+from robominer_slam.publishing import cloud_messages, pose_messages
+from robominer_slam.publishing.zenoh_session import ZenohBus
+from robominer_slam.wall_clock import WallClock
+
+FloatArray = NDArray[np.float64]
+
+MAP, ODOM, BASE = "map", "odom", "base_link"
+#: Variances of what a level body is taken to have: z (m2), roll and pitch (rad2) are not estimated.
+LEVEL_VARIANCE = (1e-4, 1e-4, 1e-4)
+#: While the pose is not known, it carries a sigma of 10 m.
+UNKNOWN_VARIANCE_M2 = 100.0
+#: Positions of (x, y, yaw) and of (z, roll, pitch) in a 6 x 6 covariance.
+PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
+LEVEL = ([2, 3, 4], [2, 3, 4])
+
+
+def full_covariance(planar: FloatArray) -> FloatArray:
+    """Covariance (6, 6) in ROS order of one over (x, y, yaw)."""
+    covariance = np.zeros((6, 6))
+    covariance[PLANAR] = planar
+    covariance[LEVEL] = LEVEL_VARIANCE
+    return covariance
+
+
+class Publisher:
+    """Publishes the results of frames.
+
+    Attributes:
+        frames: how many.
+    """
+
+    def __init__(self, bus: ZenohBus, clock: WallClock, layout: WhiskerLayout) -> None:
+        self._bus = bus
+        self._clock = clock
+        self.frames = 0
+        now = clock.now_unix_ns()
+        mounts = [
+            (now, BASE, f"whisker_{i // layout.cols}_{i % layout.cols}", geometry.to_vector7(T))
+            for i, T in enumerate(geometry.from_rotation_translation(layout.R_base_whisker, layout.p_base))
+            if layout.present[i]
+        ]
+        bus.latch("tf_static", pose_messages.transforms(mounts))
+
+    def frame(self, result: FrameResult) -> None:
+        """Publish one frame's result."""
+        stamp = self._clock.unix_ns(result.stamp_ns)
+        odometry = result.odometry
+        odom_pose = geometry.to_vector7(result.T_odom_base)
+        known = result.state not in ("lost", "relocalizing")
+        covariance = full_covariance(result.covariance)
+        if not known:
+            covariance[[0, 1], [0, 1]] = np.maximum(covariance[[0, 1], [0, 1]], UNKNOWN_VARIANCE_M2)
+        pose = geometry.to_vector7(result.T_map_base)
+        self._bus.put("pose", pose_messages.pose_with_covariance(stamp, MAP, pose, covariance))
+        vx, vy, wz = odometry.velocity
+        self._bus.put(
+            "odom",
+            pose_messages.odometry(
+                stamp,
+                ODOM,
+                BASE,
+                odom_pose,
+                full_covariance(odometry.covariance),
+                np.array([vx, vy, 0.0, 0.0, 0.0, wz]),
+                full_covariance(odometry.velocity_covariance),
+            ),
+        )
+        transforms = [(stamp, ODOM, BASE, odom_pose)]
+        if known:
+            transforms.insert(0, (stamp, MAP, ODOM, geometry.to_vector7(result.T_map_odom)))
+        self._bus.put("tf", pose_messages.transforms(transforms))
+        contacts = result.contacts
+        if self._bus.wanted("whiskers/points"):
+            self._bus.put(
+                "whiskers/points",
+                cloud_messages.contact_cloud(
+                    stamp, BASE, contacts.points, contacts.index, contacts.inclination, contacts.azimuth
+                ),
+            )
+        self.frames += 1

@@ -1,0 +1,50 @@
+"""What goes over the bus: messages received, queries, answers, and the errors of asking."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+
+class Received(NamedTuple):
+    """A message or an answer.
+
+    Attributes:
+        key: under the prefix where it lies there, else in full.
+        payload: the bytes.
+        encoding: such as `application/cdr;sensor_msgs/msg/Imu`.
+        attachment: small bytes that travel beside the payload.
+    """
+
+    key: str
+    payload: bytes
+    encoding: str
+    attachment: bytes | None
+
+    @property
+    def schema(self) -> str:
+        """What follows the semicolon of the encoding: a ROS message's type."""
+        return self.encoding.partition(";")[2]
+
+
+class Query(NamedTuple):
+    """A question; `key` as in `Received`."""
+
+    key: str
+    parameters: Mapping[str, str]
+    payload: bytes
+
+
+class Reply(NamedTuple):
+    """An answer; without an encoding it has that of the key it answers on."""
+
+    payload: bytes
+    encoding: str | None = None
+
+
+class QueryRefusedError(Exception):
+    """To be raised by who answers a query: the text goes to who asked, as an error."""
+
+
+class QueryError(Exception):
+    """Nobody answered a query, or all who did answered with an error."""

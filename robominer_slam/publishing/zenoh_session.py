@@ -1,0 +1,268 @@
+"""The bus: a Zenoh session with the robot's keys, to publish, answer queries, subscribe and ask."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from types import TracebackType
+from typing import TypeAlias
+
+import zenoh
+from zenoh import ext
+
+from robominer_slam.publishing.bus_messages import Query, QueryError, QueryRefusedError, Received, Reply
+from robominer_slam.publishing.keys import Qos, encoding_of, qos_of
+from robominer_slam.publishing.zenoh_settings import ZenohSettings, ZenohSetupError, open_session
+
+__all__ = [
+    "Query",
+    "QueryError",
+    "QueryRefusedError",
+    "Received",
+    "Reply",
+    "ZenohBus",
+    "ZenohSettings",
+    "ZenohSetupError",
+]
+
+log = logging.getLogger(__name__)
+
+#: Whoever keeps a cache says this often, if something was sent, up to where it has sent, s.
+MISS_HEARTBEAT_S = 1.0
+DEFAULT_TIMEOUT_S = 5.0
+
+_Publisher: TypeAlias = zenoh.Publisher | ext.AdvancedPublisher
+_Declared: TypeAlias = "zenoh.Subscriber[None] | ext.AdvancedSubscriber[None] | zenoh.Queryable[None]"
+
+
+class ZenohBus:
+    """A session and what is declared on it; use it with `with`. Safe to use from several threads.
+
+    Keys are relative to the prefix. Callbacks run in threads of Zenoh's; what they raise is logged.
+    """
+
+    def __init__(self, settings: ZenohSettings, prefix: str) -> None:
+        """Open the session.
+
+        Args:
+            settings: how to join the network.
+            prefix: `robominer/<robot id>`.
+
+        Raises:
+            ZenohSetupError: an endpoint that cannot be listened on or connected to.
+        """
+        self.prefix = prefix.strip("/")
+        self._session = open_session(settings)
+        self._lock = threading.Lock()
+        self._publishers: dict[str, _Publisher] = {}
+        self._latched: dict[str, Reply] = {}
+        self._declared: list[_Declared] = []
+
+    def __enter__(self) -> ZenohBus:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Take everything back and leave the network; again is harmless."""
+        with self._lock:
+            declared, self._declared = self._declared, []
+            publishers, self._publishers = list(self._publishers.values()), {}
+        if self._session.is_closed():
+            return
+        # Zenoh's stubs leave these methods without a return type.
+        leave: list[Callable[[], None]] = [entity.undeclare for entity in (*declared, *publishers)]
+        leave.append(self._session.close)
+        for step in leave:
+            step()
+
+    def links(self) -> int:
+        """Number of others that this session is connected to."""
+        return len(list(self._session.info.transports()))
+
+    def put(
+        self,
+        key: str,
+        payload: bytes,
+        encoding: str | None = None,
+        *,
+        qos: Qos | None = None,
+        attachment: bytes | None = None,
+    ) -> None:
+        """Publish.
+
+        Args:
+            key: under the prefix.
+            payload: the bytes.
+            encoding: by default that of the key (`keys.encoding_of`); `keys.cdr(type)` for `raw/<device>`.
+            qos: how it travels, by default as `keys.qos_of` says; that of a key's first message holds.
+            attachment: small bytes that travel beside the payload.
+        """
+        chosen = encoding_of(key) if encoding is None else encoding
+        self._publisher(key, qos).put(payload, encoding=chosen, attachment=attachment)
+
+    def wanted(self, key: str) -> bool:
+        """False if nobody subscribes to the key, so that its message need not be made at all."""
+        publisher = self._publisher(key, None)
+        if not isinstance(publisher, zenoh.Publisher):
+            return True
+        # Zenoh's stubs declare the status as a plain bool.
+        status: object = publisher.matching_status
+        return bool(getattr(status, "matching", status))
+
+    def latch(self, key: str, payload: bytes, encoding: str | None = None) -> None:
+        """Publish, and keep it for those who come later: by their history, or by a query of the key."""
+        reply = Reply(payload, encoding_of(key) if encoding is None else encoding)
+        with self._lock:
+            first = key not in self._latched
+            self._latched[key] = reply
+        self.put(key, payload, reply.encoding, qos=qos_of(key)._replace(cache=1))
+        if first:
+            self.queryable(key, lambda _: self._latched[key])
+
+    def subscriber(self, key: str, callback: Callable[[Received], None], *, history: bool = False) -> None:
+        """Call back with every message.
+
+        Args:
+            key: under the prefix; may have wildcards.
+            callback: runs in one thread of its own, message after message.
+            history: also get what publishers with a cache sent before, and again what was lost on the way.
+        """
+
+        def on_sample(sample: zenoh.Sample) -> None:
+            try:
+                callback(self._received(sample))
+            # Whatever it is must not end Zenoh's thread, and must be seen.
+            except Exception:
+                log.exception("a message on %s could not be taken", sample.key_expr)
+
+        subscriber: _Declared
+        if history:
+            subscriber = ext.declare_advanced_subscriber(
+                self._session,
+                self._full(key),
+                on_sample,
+                history=ext.HistoryConfig(detect_late_publishers=True),
+                recovery=ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
+            )
+        else:
+            subscriber = self._session.declare_subscriber(self._full(key), on_sample)
+        with self._lock:
+            self._declared.append(subscriber)
+
+    def queryable(self, key: str, callback: Callable[[Query], Reply | Iterable[Reply]]) -> None:
+        """Answer queries.
+
+        Args:
+            key: under the prefix; may have wildcards.
+            callback: gives the answer or the answers, one query after the other in one thread; what it refuses
+                with QueryRefusedError goes back as an error.
+        """
+
+        def on_query(query: zenoh.Query) -> None:
+            with query:
+                try:
+                    self._answer(query, key, callback)
+                except QueryRefusedError as refused:
+                    query.reply_err(str(refused))
+                except Exception:
+                    log.exception("the query %s could not be answered", query.selector)
+                    query.reply_err("internal error; the robot's log has it")
+
+        queryable = self._session.declare_queryable(self._full(key), on_query)
+        with self._lock:
+            self._declared.append(queryable)
+
+    def get(
+        self,
+        key: str,
+        parameters: Mapping[str, str] | None = None,
+        payload: bytes | None = None,
+        timeout_s: float = DEFAULT_TIMEOUT_S,
+    ) -> list[Received]:
+        """Ask, and wait for all answers.
+
+        Args:
+            key: under the prefix; may have wildcards.
+            parameters: go into the selector; values must not contain `;`.
+            payload: goes with the query.
+            timeout_s: how long to wait.
+
+        Raises:
+            QueryError: nobody answered in time, or with errors only.
+        """
+        text = ";".join(f"{name}={value}" for name, value in (parameters or {}).items())
+        selector = self._full(key) + (f"?{text}" if text else "")
+        # Several answers on one key are parts of one answer, not versions of it: keep all.
+        replies = self._session.get(
+            selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=timeout_s, payload=payload
+        )
+        received: list[Received] = []
+        errors: list[str] = []
+        for reply in replies:
+            if reply.ok is not None:
+                received.append(self._received(reply.ok))
+            elif reply.err is not None:
+                errors.append(reply.err.payload.to_bytes().decode("utf-8", "replace"))
+        if received:
+            return received
+        reason = "; ".join(errors) or "no answer; is the robot's program running?"
+        raise QueryError(f"{self._full(key)}: {reason}")
+
+    def _answer(self, query: zenoh.Query, key: str, callback: Callable[[Query], Reply | Iterable[Reply]]) -> None:
+        # A query with wildcards is answered on the key that was declared, if that has none itself.
+        asked = self._relative(str(query.key_expr)) if "*" in key else key
+        payload = b"" if query.payload is None else query.payload.to_bytes()
+        found = callback(Query(asked, _parameters(query), payload))
+        replies = [found] if isinstance(found, Reply) else found
+        for reply in replies:
+            encoding = encoding_of(asked) if reply.encoding is None else reply.encoding
+            query.reply(self._full(asked), reply.payload, encoding=encoding)
+
+    def _publisher(self, key: str, qos: Qos | None) -> _Publisher:
+        with self._lock:
+            publisher = self._publishers.get(key)
+            if publisher is None:
+                publisher = self._declare(key, qos_of(key) if qos is None else qos)
+                self._publishers[key] = publisher
+            return publisher
+
+    def _declare(self, key: str, qos: Qos) -> _Publisher:
+        if qos.cache == 0:
+            return self._session.declare_publisher(
+                self._full(key),
+                priority=qos.priority,
+                congestion_control=qos.congestion,
+                express=qos.express,
+            )
+        return ext.declare_advanced_publisher(
+            self._session,
+            self._full(key),
+            priority=qos.priority,
+            congestion_control=qos.congestion,
+            express=qos.express,
+            cache=ext.CacheConfig(qos.cache),
+            sample_miss_detection=ext.MissDetectionConfig(sporadic_heartbeat=MISS_HEARTBEAT_S, heartbeat=None),
+            publisher_detection=True,
+        )
+
+    def _full(self, key: str) -> str:
+        return f"{self.prefix}/{key}"
+
+    def _relative(self, key: str) -> str:
+        return key.removeprefix(f"{self.prefix}/")
+
+    def _received(self, sample: zenoh.Sample) -> Received:
+        attachment = None if sample.attachment is None else sample.attachment.to_bytes()
+        key = self._relative(str(sample.key_expr))
+        return Received(key, sample.payload.to_bytes(), str(sample.encoding), attachment)
+
+
+def _parameters(query: zenoh.Query) -> dict[str, str]:
+    """Split by hand: the binding's own iteration is declared as a list of pairs, but gives an iterator."""
+    pairs = (part.partition("=") for part in str(query.parameters).split(";") if part)
+    return {name: value for name, _, value in pairs}

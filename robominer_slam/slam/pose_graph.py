@@ -1,0 +1,393 @@
+"""The pose graph: keyframe poses as nodes, measured relative poses as edges, optimised over all of them.
+
+Nodes and edges live in arrays that grow; everything that depends only on which nodes are joined is kept between
+calls, so optimising after each keyframe of a growing graph costs one or two linear solves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from robominer_slam import geometry
+from robominer_slam.geometry import FloatArray
+from robominer_slam.slam import pose_graph_residuals as residuals
+from robominer_slam.slam.growing_array import GrowingArray
+from robominer_slam.slam.pose_graph_optimizer import (
+    Kernels,
+    OptimizationOptions,
+    edge_costs,
+    minimise,
+    normal_equations,
+)
+from robominer_slam.slam.pose_graph_residuals import Convention, EdgeArrays
+from robominer_slam.slam.pose_graph_system import SingularSystemError, SystemPattern
+from robominer_slam.slam.robust_kernels import kernel_code
+
+EdgeKind = Literal["odometry", "loop"]
+
+
+class PoseGraphError(ValueError):
+    """A graph that cannot be built or solved; the message says which node or edge, and what was expected."""
+
+
+@dataclass(frozen=True, slots=True)
+class OptimizationResult:
+    """What one optimisation did.
+
+    Attributes:
+        chi2_before, chi2_after: sum of e' Omega e over the enabled edges, without kernels.
+        cost_before, cost_after: the same through the kernels: what was minimised. Equal to chi2 without kernels.
+        iterations: linear systems solved.
+        converged: what is left to gain is below the tolerance.
+        seconds: wall time.
+        weights: of the kernels at the end, per edge in (0, 1]; 0 for a disabled edge; shape (m,).
+    """
+
+    chi2_before: float
+    chi2_after: float
+    cost_before: float
+    cost_after: float
+    iterations: int
+    converged: bool
+    seconds: float
+    weights: FloatArray
+
+
+class PoseGraph:
+    """A pose graph in the plane (`dim` 2) or in space (3).
+
+    Poses are (x, y, theta) in the plane, 4x4 matrices in space; m and rad. Information matrices are (3, 3) or
+    (6, 6), translation first. The first node is fixed, unless `fix` names others.
+    """
+
+    def __init__(self, dim: Literal[2, 3]) -> None:
+        """Start an empty graph.
+
+        Raises:
+            PoseGraphError: `dim` is neither 2 nor 3.
+        """
+        if dim not in (2, 3):
+            raise PoseGraphError(f"dim is {dim}; expected 2 or 3")
+        self.dim = dim
+        self._d = 3 if dim == 2 else 6
+        pose_shape = (3,) if dim == 2 else (4, 4)
+        self._poses = GrowingArray(pose_shape, np.float64)
+        self._i = GrowingArray((), np.int64)
+        self._j = GrowingArray((), np.int64)
+        self._Z_inverse = GrowingArray(pose_shape, np.float64)
+        self._information = GrowingArray((self._d, self._d), np.float64)
+        self._kernel = GrowingArray((), np.int8)
+        self._kernel_width = GrowingArray((), np.float64)
+        self._enabled = GrowingArray((), np.bool_)
+        self._kinds: list[EdgeKind] = []
+        self._fixed: set[int] = {0}
+        self._system: SystemPattern | None = None
+
+    # ------------------------------------------------------------------------------------------------ data
+
+    @property
+    def node_count(self) -> int:
+        """Number of nodes."""
+        return len(self._poses)
+
+    @property
+    def edge_count(self) -> int:
+        """Number of edges, disabled ones included."""
+        return len(self._i)
+
+    @property
+    def poses(self) -> FloatArray:
+        """Copy of all poses, (n, 3) or (n, 4, 4)."""
+        return np.array(self._poses.view)
+
+    @poses.setter
+    def poses(self, poses: ArrayLike) -> None:
+        self._poses.view[...] = self._checked_poses(poses, self.node_count, "poses")
+
+    @property
+    def edge_nodes(self) -> NDArray[np.int64]:
+        """Nodes (i, j) of all edges, shape (m, 2)."""
+        return np.stack([self._i.view, self._j.view], axis=-1)
+
+    @property
+    def edge_kinds(self) -> tuple[EdgeKind, ...]:
+        """Kind of each edge."""
+        return tuple(self._kinds)
+
+    @property
+    def edge_enabled(self) -> NDArray[np.bool_]:
+        """Whether each edge counts, shape (m,)."""
+        return np.array(self._enabled.view)
+
+    @property
+    def edge_measurements(self) -> FloatArray:
+        """T_i_j of all edges, (m, 3) or (m, 4, 4)."""
+        Z_inverse = self._Z_inverse.view
+        return geometry.se2_inverse(Z_inverse) if self.dim == 2 else geometry.inverse(Z_inverse)
+
+    @property
+    def edge_information(self) -> FloatArray:
+        """Omega of all edges, shape (m, d, d)."""
+        return np.array(self._information.view)
+
+    def add_node(self, pose: ArrayLike) -> int:
+        """Add one node with a first guess of its pose, (3,) or (4, 4); returns its number, counted from 0."""
+        return int(self.add_nodes(np.asarray(pose, dtype=np.float64)[None])[0])
+
+    def add_nodes(self, poses: ArrayLike) -> NDArray[np.int64]:
+        """Add k nodes, (k, 3) or (k, 4, 4); returns their numbers.
+
+        Raises:
+            PoseGraphError: a pose has a wrong shape, is not finite or holds no rotation.
+        """
+        checked = self._checked_poses(poses, None, "node")
+        first = self.node_count
+        self._poses.extend(checked)
+        self._system = None
+        return np.arange(first, self.node_count)
+
+    def add_edge(
+        self,
+        i: int,
+        j: int,
+        T_i_j: ArrayLike,
+        information: ArrayLike,
+        kind: EdgeKind = "odometry",
+        kernel: str | None = None,
+        kernel_width: float = 1.0,
+    ) -> int:
+        """Add one edge; returns its number, counted from 0. Arguments as in `add_edges`, without the first axis."""
+        measurement, Omega = np.asarray(T_i_j, dtype=np.float64)[None], np.asarray(information, dtype=np.float64)[None]
+        return int(self.add_edges([i], [j], measurement, Omega, kind, kernel, kernel_width)[0])
+
+    def add_edges(
+        self,
+        i: ArrayLike,
+        j: ArrayLike,
+        T_i_j: ArrayLike,
+        information: ArrayLike,
+        kind: EdgeKind = "odometry",
+        kernel: str | None = None,
+        kernel_width: float = 1.0,
+    ) -> NDArray[np.int64]:
+        """Add k edges of one kind and kernel; returns their numbers.
+
+        Args:
+            i, j: nodes, shape (k,).
+            T_i_j: measured poses of j in i, (k, 3) or (k, 4, 4).
+            information: Omega, inverse covariance of the error, shape (k, d, d), translation first.
+            kind: what the edges are from.
+            kernel: robust kernel, see `robust_kernels`; None for least squares.
+            kernel_width: of the kernel, in sigmas.
+
+        Raises:
+            PoseGraphError: a node does not exist, an edge joins a node with itself, a measurement is no pose, an
+                information matrix is not symmetric and positive semidefinite, or the kernel is not known.
+        """
+        a, b = np.asarray(i, dtype=np.int64), np.asarray(j, dtype=np.int64)
+        first = self.edge_count
+        for k in np.flatnonzero((np.minimum(a, b) < 0) | (np.maximum(a, b) >= self.node_count) | (a == b))[:1]:
+            raise PoseGraphError(
+                f"edge {first + k} joins nodes {a[k]} and {b[k]}; expected two different ones of the "
+                f"{self.node_count} nodes"
+            )
+        measurement = self._checked_poses(T_i_j, a.size, "measurement of edge")
+        Omega = self._checked_information(information, a.size)
+        try:
+            code = kernel_code(kernel)
+        except ValueError as error:
+            raise PoseGraphError(str(error)) from error
+        if not (np.isfinite(kernel_width) and kernel_width > 0.0):
+            raise PoseGraphError(f"kernel width is {kernel_width}; expected a number above 0, in sigmas")
+        self._i.extend(a)
+        self._j.extend(b)
+        self._Z_inverse.extend(geometry.se2_inverse(measurement) if self.dim == 2 else geometry.inverse(measurement))
+        self._information.extend(Omega)
+        self._kernel.extend(np.full(a.size, code))
+        self._kernel_width.extend(np.full(a.size, kernel_width))
+        self._enabled.extend(np.ones(a.size, dtype=np.bool_))
+        self._kinds.extend([kind] * a.size)
+        self._system = None
+        return np.arange(first, self.edge_count)
+
+    def set_edge_enabled(self, edges: int | Sequence[int] | NDArray[np.int64], enabled: bool) -> None:
+        """Take edges back (they stay listed but count for nothing), or let them count again."""
+        self._enabled.view[edges] = enabled
+        self._system = None
+
+    def fix(self, nodes: Sequence[int]) -> None:
+        """Fix these nodes, and no others, where they are (by default node 0).
+
+        Raises:
+            PoseGraphError: no node is given, or one does not exist.
+        """
+        chosen = {int(node) for node in nodes}
+        if not chosen or min(chosen) < 0 or max(chosen) >= self.node_count:
+            raise PoseGraphError(f"cannot fix nodes {sorted(chosen)}; expected some of the {self.node_count} nodes")
+        self._fixed = chosen
+        self._system = None
+
+    # -------------------------------------------------------------------------------------------- optimising
+
+    def edge_chi2(self, convention: Convention = "gtsam") -> FloatArray:
+        """Squared errors e' Omega e of all edges, disabled ones too, at the present poses; no kernels; shape (m,)."""
+        everything = np.ones(self.edge_count, dtype=np.bool_)
+        return edge_costs(
+            self._edge_arrays(everything), self._kernels(everything), self._poses.view, convention
+        ).squared
+
+    def chi2(self, convention: Convention = "gtsam") -> float:
+        """Sum of e' Omega e over the enabled edges, without kernels."""
+        return float(self.edge_chi2(convention)[self._enabled.view].sum())
+
+    def optimize(self, options: OptimizationOptions | None = None) -> OptimizationResult:
+        """Move the nodes to the minimum of the cost near their present poses.
+
+        Raises:
+            PoseGraphError: there is no node, or a node is joined to no fixed one, or the information matrices
+                leave a direction free.
+        """
+        options = options or OptimizationOptions()
+        started = perf_counter()
+        enabled = self._enabled.view
+        edges, kernels, system = self._edge_arrays(enabled), self._kernels(enabled), self._pattern()
+        try:
+            found = minimise(edges, kernels, self._poses.view, system, options)
+        except SingularSystemError as error:
+            raise PoseGraphError(
+                f"the edges do not determine all poses ({error}); expected information of full rank"
+            ) from error
+        self._poses.view[...] = found.poses
+        if self.dim == 3:
+            # Products of many small rotations drift from orthogonality by rounding; never by more than that.
+            free = system.free_nodes
+            self._poses.view[free] = geometry.normalise_pose(found.poses[free])
+        weights = np.zeros(self.edge_count)
+        weights[enabled] = found.after.weights
+        return OptimizationResult(
+            chi2_before=float(found.before.squared.sum()),
+            chi2_after=float(found.after.squared.sum()),
+            cost_before=found.before.cost,
+            cost_after=found.after.cost,
+            iterations=found.iterations,
+            converged=found.converged,
+            seconds=perf_counter() - started,
+            weights=weights,
+        )
+
+    def joint_covariance(self, nodes: Sequence[int]) -> FloatArray:
+        """Joint covariance of chosen nodes at the present poses, shape (k d, k d).
+
+        Each node's part is of the twist eta (translation first) in X = X_present Exp(eta): in the node's own
+        frame, m2 and rad2. Fixed nodes have none. Edges count with the weights of their kernels.
+
+        Raises:
+            PoseGraphError: as `optimize`.
+        """
+        d, k = self._d, len(nodes)
+        enabled = self._enabled.view
+        edges, poses, system = self._edge_arrays(enabled), self._poses.view, self._pattern()
+        if system.free_nodes.size == 0:
+            return np.zeros((k * d, k * d))
+        pivot = residuals.positions(self.dim, poses).mean(axis=0)
+        costs = edge_costs(edges, self._kernels(enabled), poses, "gtsam")
+        _, blocks = normal_equations(edges, costs, poses, pivot, system, "gtsam")
+        place = np.full(self.node_count, -1)
+        place[system.free_nodes] = np.arange(system.free_nodes.size)
+        to_node = residuals.world_to_node(self.dim, poses[list(nodes)], pivot)
+        selected = np.zeros((system.free_nodes.size * d, k * d))
+        for column, node in enumerate(nodes):
+            if place[node] >= 0:
+                rows = slice(place[node] * d, (place[node] + 1) * d)
+                selected[rows, column * d : (column + 1) * d] = to_node[column].T
+        try:
+            covariance = selected.T @ system.factorise(blocks).solve(selected)
+        except SingularSystemError as error:
+            raise PoseGraphError(f"the edges do not determine all poses ({error})") from error
+        return np.asarray(0.5 * (covariance + covariance.T))
+
+    def marginal_covariance(self, nodes: Sequence[int]) -> FloatArray:
+        """Covariance of each chosen node on its own, shape (k, d, d); see `joint_covariance`."""
+        joint = self.joint_covariance(nodes).reshape(len(nodes), self._d, len(nodes), self._d)
+        return np.array(np.einsum("kakb->kab", joint))
+
+    def relative_covariance(self, i: int, j: int) -> FloatArray:
+        """Covariance (d, d) of X_i^-1 X_j, as a twist in the frame of j: what a loop (i, j) is compared with."""
+        poses = self._poses.view
+        T_j_i = residuals.relative_poses(self.dim, poses, np.array([j]), np.array([i]))[0]
+        Ad = geometry.se2_adjoint(T_j_i) if self.dim == 2 else geometry.se3_adjoint(T_j_i)
+        A = np.concatenate([-Ad, np.eye(self._d)], axis=1)
+        return np.asarray(A @ self.joint_covariance([i, j]) @ A.T)
+
+    # ---------------------------------------------------------------------------------------------- internals
+
+    def _edge_arrays(self, which: NDArray[np.bool_]) -> EdgeArrays:
+        k = slice(None) if which.all() else np.flatnonzero(which)
+        return EdgeArrays(
+            self.dim, self._i.view[k], self._j.view[k], self._Z_inverse.view[k], self._information.view[k]
+        )
+
+    def _kernels(self, which: NDArray[np.bool_]) -> Kernels:
+        return Kernels(self._kernel.view[which], self._kernel_width.view[which])
+
+    def _pattern(self) -> SystemPattern:
+        if self._system is None:
+            if self.node_count == 0:
+                raise PoseGraphError("the graph has no node; add the first pose before optimising")
+            enabled = self._enabled.view
+            i, j = self._i.view[enabled], self._j.view[enabled]
+            fixed = np.zeros(self.node_count, dtype=np.bool_)
+            fixed[list(self._fixed)] = True
+            self._check_joined(i, j, fixed)
+            self._system = SystemPattern(i, j, fixed, self._d)
+        return self._system
+
+    def _check_joined(self, i: NDArray[np.int64], j: NDArray[np.int64], fixed: NDArray[np.bool_]) -> None:
+        n = self.node_count
+        _, component = connected_components(coo_matrix((np.ones(i.size), (i, j)), shape=(n, n)), directed=False)
+        adrift = np.flatnonzero(~np.isin(component, component[fixed]))
+        if adrift.size:
+            raise PoseGraphError(
+                f"node {adrift[0]} is not joined to a fixed node by enabled edges ({adrift.size} of {n} nodes are "
+                "not); add edges or fix one of them"
+            )
+
+    def _checked_poses(self, poses: ArrayLike, count: int | None, what: str) -> FloatArray:
+        p = np.asarray(poses, dtype=np.float64)
+        shape = (3,) if self.dim == 2 else (4, 4)
+        if p.ndim != 1 + len(shape) or p.shape[1:] != shape or count not in (None, p.shape[0]):
+            raise PoseGraphError(f"{what}: shape {p.shape}; expected ({'k' if count is None else count}, *{shape})")
+        good = np.isfinite(p).reshape(p.shape[0], -1).all(axis=1)
+        if self.dim == 3:
+            R = p[:, :3, :3]
+            off = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).reshape(p.shape[0], 9).max(axis=1, initial=0.0)
+            good &= (off < 1e-6) & (np.linalg.det(R) > 0.0)
+        for k in np.flatnonzero(~good)[:1]:
+            raise PoseGraphError(f"{what} {k} of those added is not a finite pose with a proper rotation")
+        return p
+
+    def _checked_information(self, information: ArrayLike, count: int) -> FloatArray:
+        Omega = np.asarray(information, dtype=np.float64)
+        if Omega.shape != (count, self._d, self._d):
+            raise PoseGraphError(f"information: shape {Omega.shape}; expected ({count}, {self._d}, {self._d})")
+        if not np.isfinite(Omega).all():
+            raise PoseGraphError("information: a number is not finite; expected a finite symmetric matrix")
+        transposed = np.swapaxes(Omega, -1, -2)
+        scale = np.abs(Omega).reshape(count, -1).max(axis=1, initial=0.0)
+        skew = np.abs(Omega - transposed).reshape(count, -1).max(axis=1, initial=0.0)
+        Omega = 0.5 * (Omega + transposed)
+        least = np.linalg.eigvalsh(Omega)[:, 0]
+        for k in np.flatnonzero((skew > 1e-9 * scale) | (least < -1e-9 * scale) | (scale == 0.0))[:1]:
+            raise PoseGraphError(
+                f"information matrix {k} of those added is not symmetric and positive semidefinite (least "
+                f"eigenvalue {least[k]:.3g})"
+            )
+        return Omega

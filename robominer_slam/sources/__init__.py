@@ -1,0 +1,1 @@
+"""Where measurements come from: serial ports, a recording, or Zenoh from another board."""

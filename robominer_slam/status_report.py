@@ -1,0 +1,100 @@
+"""What `status` says: localisation, SLAM, devices, whiskers, process, in words and figures."""
+
+from __future__ import annotations
+
+import resource
+from collections.abc import Sequence
+
+import numpy as np
+
+from drivers.device import DeviceStatus
+from robominer_slam.frame_result import FrameResult
+from robominer_slam.mapping.keyframe_map import KeyframeMap
+from robominer_slam.pipeline import Pipeline
+from robominer_slam.publishing.report_messages import Diagnostic, Level
+from robominer_slam.store import MapStore
+from robominer_slam.wall_clock import WallClock
+
+#: No whisker frame for this long: poses are stale.
+STALE_S = 1.0
+
+
+def device_diagnostic(status: DeviceStatus) -> Diagnostic:
+    """One device."""
+    level = Level.OK if status.state == "streaming" else Level.WARN if status.state == "synchronising" else Level.ERROR
+    values = {
+        "port": status.path or "",
+        "firmware": status.firmware,
+        "clock.offset_ns": str(status.clock_offset_ns),
+        "clock.uncertainty_us": f"{status.clock_uncertainty_ns / 1000:.0f}",
+        "clock.drift_ppm": f"{status.clock_drift * 1e6:.1f}",
+        **{f"count.{name}": str(count) for name, count in sorted(status.counters.items())},
+    }
+    text = f"{status.state}: {status.fault}" if status.fault else status.state
+    return Diagnostic(f"device/{status.name}", level, text, values, status.name)
+
+
+def slam_diagnostic(
+    frame: FrameResult | None, frame_age_s: float, pipeline: Pipeline, keyframe_map: KeyframeMap, digest: str
+) -> Diagnostic:
+    """Localisation and map."""
+    values = {
+        "localization.state": frame.state if frame is not None else "lost",
+        "map.version": str(keyframe_map.version),
+        "map.digest": digest,
+        "keyframes": str(len(keyframe_map.keyframes)),
+        "loop_closures": str(keyframe_map.closures),
+        "paused": str(pipeline.paused).lower(),
+        "late_measurements": str(pipeline.reorder.late),
+        "dropped_measurements": str(pipeline.reorder.dropped),
+        "wrong_size_frames": str(pipeline.wrong_size_frames),
+        "out_of_range_readings": str(pipeline.angle_estimator.out_of_range),
+    }
+    if pipeline.runner is not None:
+        values["backend.late"] = str(pipeline.runner.late)
+        values["backend.max_late_s"] = f"{pipeline.runner.max_late_ns * 1e-9:.3f}"
+        values["backend.busy_s"] = f"{pipeline.runner.busy_s:.3f}"
+    if frame is None:
+        return Diagnostic("localization", Level.WARN, "no whisker frame yet", values)
+    values["sigma_xy_m"] = f"{np.sqrt(np.trace(frame.covariance[:2, :2])):.3f}"
+    values["sigma_yaw_deg"] = f"{np.rad2deg(np.sqrt(frame.covariance[2, 2])):.2f}"
+    values["contacts"] = str(len(frame.contacts.index))
+    if frame_age_s > STALE_S:
+        return Diagnostic("localization", Level.STALE, f"no whisker frame for {frame_age_s:.1f} s", values)
+    return Diagnostic("localization", Level.OK, frame.state, values)
+
+
+def whiskers_diagnostic(frame: FrameResult, cols: int) -> Diagnostic:
+    """Whiskers that say nothing, by row and column."""
+    silent = [f"({i // cols}, {i % cols})" for i in np.flatnonzero(~frame.angles.valid)]
+    values = {"valid": str(int(frame.angles.valid.sum())), "invalid": " ".join(silent)}
+    if silent:
+        return Diagnostic("whiskers", Level.WARN, f"{len(silent)} without a usable reading: {' '.join(silent)}", values)
+    return Diagnostic("whiskers", Level.OK, "all readings usable", values)
+
+
+def store_diagnostic(store: MapStore) -> Diagnostic:
+    """The database."""
+    values = {"written": str(store.written), "dropped": str(store.dropped), "map_id": str(store.map_id)}
+    if store.fault:
+        return Diagnostic("store", Level.ERROR, f"not stored: {store.fault}", values)
+    return Diagnostic("store", Level.OK, f"{store.written} keyframes stored", values)
+
+
+def process_diagnostic(clock: WallClock, source_dropped: int) -> Diagnostic:
+    """The process."""
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    values = {
+        "cpu_s": f"{usage.ru_utime + usage.ru_stime:.2f}",
+        "peak_memory_MB": f"{usage.ru_maxrss / 1024:.1f}",
+        "clock.offset_ns": str(clock.offset_ns),
+        "clock.steps": str(clock.steps),
+        "queue.dropped": str(source_dropped),
+    }
+    level = Level.WARN if source_dropped else Level.OK
+    return Diagnostic("process", level, "measurements dropped" if source_dropped else "running", values)
+
+
+def worst(entries: Sequence[Diagnostic]) -> str:
+    """One line for logs: the entries that are not well."""
+    return "; ".join(f"{e.name}: {e.message}" for e in entries if e.level is not Level.OK)

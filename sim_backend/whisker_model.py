@@ -1,0 +1,155 @@
+"""The whisker array as a MuJoCo model: rods on two hinges each, over ground and objects.
+
+Every parameter of the mechanics and of the contacts is here, with its reason.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from robominer_slam.layout import WhiskerLayout
+from sim_backend.world import World
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class WhiskerMechanics:
+    """Rod and joint of a whisker.
+
+    Attributes:
+        mass: of the rod, kg (the thesis's 8 g; a steel rod of 3 mm by 150 mm has 8.3 g).
+        radius: of the rod, m.
+        stiffness: of both hinges, N m/rad. The thesis's 5.7 is N/rad; times the lever between rod and membrane
+            (some millimetres to a centimetre) it is 0.03 to 0.1 N m/rad.
+        damping_ratio: zeta of the free oscillation; 0.47 is the thesis's logarithmic decrement of 3.35.
+    """
+
+    mass: float = 0.008
+    radius: float = 0.0015
+    stiffness: float = 0.1
+    damping_ratio: float = 0.47
+
+    def inertia(self, length: float) -> float:
+        """Moment of inertia of a rod about its joint, kg m2."""
+        return self.mass * length**2 / 3.0
+
+    def damping(self, length: float) -> float:
+        """Viscous damping of a hinge, c = 2 zeta sqrt(I k), N m s/rad."""
+        return 2.0 * self.damping_ratio * float(np.sqrt(self.inertia(length) * self.stiffness))
+
+
+@dataclass(frozen=True, slots=True)
+class ContactModel:
+    """Contacts of the rods with ground and objects.
+
+    A soft-contact engine has two ways to spoil a map. Rods sink in when the contact is soft. And they chatter
+    when it is hard: MuJoCo's convex friction cone lifts a sliding contact by friction * b / k * speed (b, k:
+    damping and stiffness of the contact), the contact is lost for a step, and the bent rod shoots 2 to 4 mm deep.
+    Three things together prevent both: a friction reference slower than the normal one keeps the lift small;
+    an impedance that starts at 0.8 keeps some pressed-in depth in hand, so that the contact holds on convex
+    ground; `margin` puts that depth above the surface instead of below it.
+
+    Attributes:
+        time_constant: of the normal direction, s; at least twice the time step.
+        friction_time_constant: of the tangential directions, s.
+        friction: Coulomb's coefficient, steel on rock.
+        impedance: MuJoCo's solimp d0, dwidth, width.
+        margin: thickness of the layer in which a contact's force builds up, m.
+        cone_ratio: MuJoCo's impratio; 3 lets sliding reach Coulomb's limit in spite of the slow reference.
+    """
+
+    time_constant: float = 0.008
+    friction_time_constant: float = 0.04
+    friction: float = 0.5
+    impedance: tuple[float, float, float] = (0.8, 0.95, 0.002)
+    margin: float = 0.0004
+    cone_ratio: float = 3.0
+
+
+#: Each whisker hangs on a body of its own that is moved as the grid moves. Its mass, kg and kg m2, is so large
+#: that no contact moves it between two steps. One common body would couple all whiskers in the contact solver,
+#: which makes a step two to three times slower.
+CARRIER_MASS = 100.0
+GEOM_PREFIX = "whisker"
+
+
+def build(
+    world: World,
+    layout: WhiskerLayout,
+    mechanics: WhiskerMechanics,
+    contact: ContactModel,
+    time_step: float,
+) -> mujoco.MjModel:
+    """The compiled model. Joint order: for each whisker a free joint, then the hinges about its x and y axes."""
+    statics, static_names = _world_geoms(world)
+    whiskers = [_whisker(i, layout, mechanics) for i in range(layout.count)]
+    solref = f"{contact.time_constant} 1"
+    parameters = (
+        f'condim="3" friction="{contact.friction} {contact.friction} 0.005 0.0001 0.0001" solref="{solref}" '
+        f'solreffriction="{contact.friction_time_constant} 1" margin="{contact.margin}" '
+        f'solimp="{" ".join(map(str, contact.impedance))}"'
+    )
+    pairs = [
+        f'<pair geom1="{static}" geom2="{GEOM_PREFIX}{i}" {parameters}/>'
+        for static in static_names
+        for i in range(layout.count)
+    ]
+    ny, nx = world.ground.z.shape
+    low, high = float(world.ground.z.min()), float(world.ground.z.max())
+    (x0, x1), (y0, y1) = world.ground.extent
+    size = f"{(x1 - x0) / 2} {(y1 - y0) / 2} {max(high - low, 1e-6)} 0.1"
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco model="{world.name}">
+        <option timestep="{time_step}" integrator="implicitfast" solver="CG" cone="elliptic" jacobian="sparse"
+          impratio="{contact.cone_ratio}" tolerance="1e-10"/>
+        <size memory="64M"/>
+        <visual><global offwidth="1600" offheight="900"/></visual>
+        <default><geom solref="{solref}"/></default>
+        <asset><hfield name="ground" nrow="{ny}" ncol="{nx}" size="{size}"/></asset>
+        <worldbody>
+        <light pos="1.5 0.5 3" dir="0 0.2 -1" castshadow="true"/>
+        <geom name="ground" type="hfield" hfield="ground" pos="{(x0 + x1) / 2} {(y0 + y1) / 2} {low}"
+          contype="0" conaffinity="0" rgba="0.62 0.55 0.45 1"/>
+        {"".join(statics)}{"".join(whiskers)}
+        </worldbody>
+        <contact>{"".join(pairs)}</contact></mujoco>"""
+    )
+    model.hfield_data[:] = ((world.ground.z - low) / max(high - low, 1e-6)).ravel()
+    return model
+
+
+def _world_geoms(world: World) -> tuple[list[str], list[str]]:
+    geoms = [
+        f'<geom name="{s.name}" type="{s.shape}" size="{_text(s.size)}" pos="{_text(s.centre)}" '
+        f'quat="{_text(s.quaternion_wxyz())}" contype="0" conaffinity="0" rgba="0.45 0.42 0.5 1"/>'
+        for s in world.solids
+    ]
+    return geoms, ["ground", *(s.name for s in world.solids)]
+
+
+def _whisker(i: int, layout: WhiskerLayout, mechanics: WhiskerMechanics) -> str:
+    """One rod: whiskers touch each other without friction, ground and objects only through the explicit pairs."""
+    length = float(layout.length[i])
+    hinge = f'type="hinge" stiffness="{mechanics.stiffness}" damping="{mechanics.damping(length)}"'
+    quat = np.roll(Rotation.from_matrix(layout.R_base_whisker[i]).as_quat(), 1)
+    across, along = mechanics.mass * length**2 / 12.0, mechanics.mass * mechanics.radius**2 / 2.0
+    carrier = f'mass="{CARRIER_MASS}" diaginertia="{CARRIER_MASS} {CARRIER_MASS} {CARRIER_MASS}"'
+    mask = int(layout.present[i])
+    return (
+        f'<body pos="{_text(layout.p_base[i])}" quat="{_text(quat)}" gravcomp="1"><freejoint/>'
+        f'<inertial pos="0 0 0" {carrier}/><body><joint axis="1 0 0" {hinge}/><joint axis="0 1 0" {hinge}/>'
+        f'<inertial pos="0 0 {length / 2}" mass="{mechanics.mass}" diaginertia="{across} {across} {along}"/>'
+        f'<geom name="{GEOM_PREFIX}{i}" type="capsule" fromto="0 0 0.002 0 0 {length - mechanics.radius}" '
+        f'size="{mechanics.radius}" condim="1" contype="{mask}" conaffinity="{mask}" rgba="0.8 0.8 0.85 1"/>'
+        f"</body></body>"
+    )
+
+
+def _text(values: FloatArray | tuple[float, ...]) -> str:
+    return " ".join(repr(float(value)) for value in values)
