@@ -23,10 +23,11 @@ from robominer_slam.publisher import Publisher
 from robominer_slam.publishing import report_messages
 from robominer_slam.publishing.bus_messages import Query, Reply
 from robominer_slam.publishing.report_messages import Diagnostic
-from robominer_slam.publishing.telemetry import encode_frame
+from robominer_slam.publishing.telemetry import Health
 from robominer_slam.publishing.zenoh_session import ZenohBus
 from robominer_slam.sources.source import MeasurementSource
 from robominer_slam.store import MapStore
+from robominer_slam.telemetry_frame import telemetry
 from robominer_slam.wall_clock import WallClock
 
 log = logging.getLogger(__name__)
@@ -62,7 +63,7 @@ class Daemon:
         self._map_service = MapService(bus, self._clock, self._map, section.grid_cell, section.obstacle_height)
         self._commands = Commands(self._pipeline, self._map, store, self._new_map)
         self._last_frame: FrameResult | None = None
-        self._telemetry_ns = self._status_ns = 0
+        self._telemetry_ns = self._status_ns = self._telemetry_count = 0
         self._declare_queries()
 
     def run(self, stop: threading.Event) -> None:
@@ -89,10 +90,30 @@ class Daemon:
         self._publisher.frame(result)
         if result.stamp_ns - self._telemetry_ns >= TELEMETRY_INTERVAL_NS:
             self._telemetry_ns = result.stamp_ns
-            self._bus.put("telemetry", encode_frame(self._clock.unix_ns(result.stamp_ns), result))
+            self._telemetry(result)
         if self._last_frame is None:
             log.info("first whisker frame: publishing poses under %s", self._bus.prefix)
         self._last_frame = result
+
+    def _telemetry(self, result: FrameResult) -> None:
+        stamp = self._clock.unix_ns(result.stamp_ns)
+        message = telemetry(self._telemetry_count, stamp, result, self._layout, self._map, self._health(result))
+        self._telemetry_count += 1
+        self._bus.put("telemetry", message)
+
+    def _health(self, result: FrameResult) -> Health:
+        health = Health(0)
+        if not result.angles.valid[self._layout.present].all():
+            health |= Health.WHISKERS_FAULTY
+        if any(device.state != "streaming" for device in self._source.status()):
+            health |= Health.CLOCK_NOT_SYNCHRONISED
+        if self._store.fault:
+            health |= Health.STORE_FAILING
+        if self._pipeline.paused:
+            health |= Health.PAUSED
+        if self._source.dropped:
+            health |= Health.MEASUREMENTS_DROPPED
+        return health
 
     def _status(self) -> None:
         now = time.monotonic_ns()
@@ -120,7 +141,7 @@ class Daemon:
             runner = self._pipeline.runner
             if runner is not None:
                 for result in runner.close():
-                    self._map_service.take(result)
+                    self._map.take(result)
                     self._store.add(result, self._clock.offset_ns)
         if self._store.flush(10.0):
             self._store.save_poses(self._map.poses)

@@ -70,7 +70,8 @@ def squared_norm(v: FloatArray) -> FloatArray:
 def wrap_angle(angle: ArrayLike) -> FloatArray:
     """Angle(s) in (-pi, pi], rad. Those already inside come back unchanged to the bit."""
     a = np.asarray(angle, dtype=np.float64)
-    return np.asarray(a - 2.0 * np.pi * np.ceil((a - np.pi) / (2.0 * np.pi)))
+    wrapped = a - 2.0 * np.pi * np.rint(a / (2.0 * np.pi))
+    return np.where(np.abs(wrapped) >= np.pi, np.pi, wrapped)
 
 
 def hat(v: ArrayLike) -> FloatArray:

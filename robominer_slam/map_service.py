@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import secrets
+
 import numpy as np
 
 from robominer_slam import geometry
@@ -14,7 +16,6 @@ from robominer_slam.publishing import cloud_messages, pose_messages, report_mess
 from robominer_slam.publishing.bus_messages import QueryRefusedError, Reply
 from robominer_slam.publishing.map_stream import MapStreamEncoder
 from robominer_slam.publishing.zenoh_session import ZenohBus
-from robominer_slam.slam.keyframe import BackendResult
 from robominer_slam.wall_clock import WallClock
 
 PATH_INTERVAL_NS = 1_000_000_000
@@ -39,38 +40,38 @@ class MapService:
         self._clock = clock
         self._grid_cell = grid_cell
         self._obstacle_height = obstacle_height
-        self._stream = MapStreamEncoder()
+        self._stream = MapStreamEncoder(secrets.randbits(64))
         self._path_ns: int | None = None
         self._path_version = 0
 
     def frame(self, result: FrameResult) -> None:
         """Take what the back-end found, and publish what changed."""
         for backend_result in result.backend_results:
-            self.take(backend_result)
+            self.keyframe_map.take(backend_result)
         if result.backend_results:
-            self._stream.set_poses(geometry.to_vector7(self.keyframe_map.poses))
-            for message in self._stream.updates():
-                self._bus.put("map/updates", message)
+            self._publish_updates()
         due = self._path_ns is None or result.stamp_ns - self._path_ns >= PATH_INTERVAL_NS
         if due and self._path_version != self.keyframe_map.version:
             self._path_ns = result.stamp_ns
             self._path_version = self.keyframe_map.version
             self._bus.put("path", self.path(self._clock.unix_ns(result.stamp_ns)))
 
-    def take(self, result: BackendResult) -> None:
-        """Take a keyframe into the map without publishing it yet."""
-        keyframe = self.keyframe_map.take(result)
-        self._stream.add_keyframe(keyframe.id, self._clock.unix_ns(keyframe.stamp_ns), keyframe.points)
+    def _publish_updates(self) -> None:
+        whole = self.keyframe_map
+        poses = geometry.to_vector7(whole.poses)
+        for message in self._stream.update(whole.version, whole.keyframes, poses, self._clock.offset_ns):
+            self._bus.put("map/updates", message)
 
     def new_map(self) -> None:
-        """Start anew with an empty map."""
+        """Start anew with an empty map, under another id."""
         self.keyframe_map.clear()
-        self._stream = MapStreamEncoder()
+        self._stream = MapStreamEncoder(secrets.randbits(64))
+        self._publish_updates()
 
     @property
     def digest(self) -> str:
         """Digest of the map as the stream carries it."""
-        return self._stream.digest()
+        return self._stream.state.digest().hex()
 
     def path(self, stamp_ns: int) -> bytes:
         """nav_msgs/Path of the keyframes."""

@@ -9,6 +9,7 @@ from robominer_slam import geometry
 from robominer_slam.frame_result import FrameResult
 from robominer_slam.layout import WhiskerLayout
 from robominer_slam.publishing import cloud_messages, pose_messages
+from robominer_slam.publishing.pose_messages import StampedTransform
 from robominer_slam.publishing.zenoh_session import ZenohBus
 from robominer_slam.wall_clock import WallClock
 
@@ -45,7 +46,7 @@ class Publisher:
         self.frames = 0
         now = clock.now_unix_ns()
         mounts = [
-            (now, BASE, f"whisker_{i // layout.cols}_{i % layout.cols}", geometry.to_vector7(T))
+            StampedTransform(now, BASE, f"whisker_{i // layout.cols}_{i % layout.cols}", geometry.to_vector7(T))
             for i, T in enumerate(geometry.from_rotation_translation(layout.R_base_whisker, layout.p_base))
             if layout.present[i]
         ]
@@ -75,9 +76,9 @@ class Publisher:
                 full_covariance(odometry.velocity_covariance),
             ),
         )
-        transforms = [(stamp, ODOM, BASE, odom_pose)]
+        transforms = [StampedTransform(stamp, ODOM, BASE, odom_pose)]
         if known:
-            transforms.insert(0, (stamp, MAP, ODOM, geometry.to_vector7(result.T_map_odom)))
+            transforms.insert(0, StampedTransform(stamp, MAP, ODOM, geometry.to_vector7(result.T_map_odom)))
         self._bus.put("tf", pose_messages.transforms(transforms))
         contacts = result.contacts
         if self._bus.wanted("whiskers/points"):

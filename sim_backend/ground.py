@@ -1,28 +1,44 @@
-"""Uneven ground as a height field of triangles, the same ones that the physics engine collides with."""
+"""Uneven ground as a smooth height field: the surface that whiskers touch and that maps are compared with."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float64]
 
+#: Quadratic B-spline: row k holds the coefficient of t^k in the weights of the three control points around t = 0.
+SPLINE = np.array([[0.125, 0.75, 0.125], [-0.5, 0.0, 0.5], [0.5, -1.0, 0.5]])
+
 
 @dataclass(frozen=True, slots=True)
 class HeightField:
-    """A regular grid of heights; between its nodes the surface is two triangles per cell.
+    """A smooth surface over a regular grid of nodes.
+
+    It is the quadratic B-spline with the nodes' heights as control points: smooth in slope, so that a sliding rod
+    finds no edges that the ground does not have, and local, so that it is cheap to evaluate.
 
     Attributes:
         origin: x, y of node (0, 0), m.
         cell: distance of neighbouring nodes in x and y, m.
-        z: heights of the nodes, shape (number in y, number in x), m.
+        z: heights of the control points, shape (number in y, number in x), at least (3, 3), m.
+        polynomial: around each node but those on the edge, the surface as sum of p[b, a] u^a v^b with u, v in
+            cells from the node, -0.5 to 0.5; shape (number in y - 2, number in x - 2, 3, 3), m.
     """
 
     origin: tuple[float, float]
     cell: float
     z: FloatArray
+    polynomial: FloatArray = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if min(self.z.shape) < 3:
+            raise ValueError(f"a height field needs at least 3 x 3 nodes, found {self.z.shape}")
+        near = np.lib.stride_tricks.sliding_window_view(self.z, (3, 3))
+        polynomial = np.einsum("bj,yxji,ai->yxba", SPLINE, near, SPLINE)
+        object.__setattr__(self, "polynomial", np.ascontiguousarray(polynomial))
 
     @property
     def extent(self) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -32,21 +48,33 @@ class HeightField:
         return (x, x + (nx - 1) * self.cell), (y, y + (ny - 1) * self.cell)
 
     def height(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
-        """Height of the surface at (x, y), m; outside the grid, that of the nearest edge.
+        """Height of the surface at (x, y), m; beyond the middle of the outermost cells, that of the nearest place."""
+        p, u, v = self._patch(x, y)
+        along_u = p[..., 0] + u[..., None] * (p[..., 1] + u[..., None] * p[..., 2])
+        height: FloatArray = along_u[..., 0] + v * (along_u[..., 1] + v * along_u[..., 2])
+        return height
 
-        A cell's diagonal runs from its corner (0, 0) to its corner (1, 1), in grid units (x, y), as in
-        MuJoCo's height fields, so that this is exactly the surface that contacts are computed with.
-        """
+    def height_and_normal(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Height of the surface, shape (n,), m, and its upward unit normal, shape (n, 3), at (x, y)."""
+        p, u, v = self._patch(x, y)
+        u2, v2 = u[:, None], v[:, None]
+        along_u = p[:, :, 0] + u2 * (p[:, :, 1] + u2 * p[:, :, 2])
+        along_v = p[:, 0] + v2 * (p[:, 1] + v2 * p[:, 2])
+        normal = np.empty((len(u), 3))
+        normal[:, 0] = (along_v[:, 1] + 2.0 * u * along_v[:, 2]) / -self.cell
+        normal[:, 1] = (along_u[:, 1] + 2.0 * v * along_u[:, 2]) / -self.cell
+        normal[:, 2] = 1.0
+        normal /= np.sqrt((normal**2).sum(axis=1))[:, None]
+        return along_u[:, 0] + v * (along_u[:, 1] + v * along_u[:, 2]), normal
+
+    def _patch(self, x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The polynomial at each place, shape (..., 3, 3), and the place in it."""
         ny, nx = self.z.shape
-        u = np.clip((np.asarray(x, dtype=np.float64) - self.origin[0]) / self.cell, 0.0, nx - 1)
-        v = np.clip((np.asarray(y, dtype=np.float64) - self.origin[1]) / self.cell, 0.0, ny - 1)
-        i = np.minimum(u.astype(np.intp), nx - 2)
-        j = np.minimum(v.astype(np.intp), ny - 2)
-        u, v = u - i, v - j
-        z00, z10, z01, z11 = self.z[j, i], self.z[j, i + 1], self.z[j + 1, i], self.z[j + 1, i + 1]
-        right = z00 + u * (z10 - z00) + v * (z11 - z10)
-        left = z00 + u * (z11 - z01) + v * (z01 - z00)
-        return np.where(u >= v, right, left)
+        u = np.clip((np.asarray(x, dtype=np.float64) - self.origin[0]) / self.cell, 0.5, nx - 1.5)
+        v = np.clip((np.asarray(y, dtype=np.float64) - self.origin[1]) / self.cell, 0.5, ny - 1.5)
+        i = np.minimum((u + 0.5).astype(np.intp), nx - 2)
+        j = np.minimum((v + 0.5).astype(np.intp), ny - 2)
+        return self.polynomial[j - 1, i - 1], u - i, v - j
 
     def shifted(self, dz: float) -> HeightField:
         """The same ground, higher by `dz` metres."""

@@ -22,6 +22,11 @@ BoolArray = NDArray[np.bool_]
 #: 400 steps a second: a free whisker's frequency and decrement come out within 5 % of the damped oscillator's
 #: (the implicit integrator adds damping of the order of the step), 16 steps make a frame of 40 ms.
 TIME_STEP = 0.0025
+#: The ground planes are laid anew every 10 ms: a tip has then slid 1.5 mm, on a surface that curves by 1 mm over
+#: 20 mm.
+GROUND_STEPS = 4
+#: Contacts are looked at every 5 ms: half an interval is a fifteenth of the frame.
+CONTACT_STEPS = 2
 #: Normal force above which a contact counts, N: a thousandth of what bends a whisker by one degree.
 CONTACT_FORCE = 1e-5
 
@@ -121,6 +126,8 @@ class PhysicsEngine:
         self._before = np.minimum(position.astype(np.intp), self._steps - 1)
         self._share = position - self._before
         self._nearest = np.minimum(np.round(position).astype(np.intp), self._steps - 1)
+        self._ground = world.ground
+        self._reach = layout.length - (mechanics or WhiskerMechanics()).radius
         self._frame = 0
         self._frame_interval = frame_interval
         self._depth = np.full(n, np.nan)
@@ -166,18 +173,31 @@ class PhysicsEngine:
             # The force that moves so heavy a body as wanted lets the rods feel the acceleration during the step.
             self._force[:, :6] = CARRIER_MASS * carriers.acceleration[k]
             hinge[k] = self._qpos[:, 7:]
+            if k % GROUND_STEPS == 0:
+                self._place_ground(carriers.pose[k, :, :3], carriers.R[k], hinge[k])
             mujoco.mj_step(self.model, self.data)
-            self._note_contacts(contact[k])
+            if k % CONTACT_STEPS == 0:
+                self._note_contacts(contact[k : k + CONTACT_STEPS])
         hinge[count] = self._qpos[:, 7:]
         warnings = self.data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number
         if warnings or not np.isfinite(hinge[count]).all():
             raise PhysicsError(f"the physics became unstable at {self.data.time:.3f} s of simulated time")
         return hinge, contact
 
+    def _place_ground(self, p_mount: FloatArray, R_map_whisker: FloatArray, hinge: FloatArray) -> None:
+        """Lay each whisker's ground plane tangent to the ground under the centre of its rounded tip."""
+        direction = np.einsum("nij,nj->ni", R_map_whisker, rod_direction(hinge))
+        under = p_mount + self._reach[:, None] * direction
+        under[:, 2], normal = self._ground.height_and_normal(under[:, 0], under[:, 1])
+        self.data.mocap_pos[:] = under
+        # The shortest turn of the plane's z-axis to the normal; MuJoCo normalises it.
+        self.data.mocap_quat[:, 0] = 1.0 + normal[:, 2]
+        self.data.mocap_quat[:, 1] = -normal[:, 1]
+        self.data.mocap_quat[:, 2] = normal[:, 0]
+
     def _note_contacts(self, contact: BoolArray) -> None:
         """Mark whiskers that ground or an object presses on, and how deep; each contact's first row is normal."""
         found = self.data.contact
-        self._depth[:] = np.nan
         if not self.data.ncon:
             return
         whisker = self._whisker_of_geom[found.geom]
@@ -186,6 +206,7 @@ class PhysicsEngine:
             return
         who = whisker[outside].max(axis=1)
         pressed = self.data.efc_force[found.efc_address[outside]] > CONTACT_FORCE
-        contact[who[pressed]] = True
+        contact[:, who[pressed]] = True
+        self._depth[:] = np.nan
         np.fmax.at(self._depth, who, -found.dist[outside])
 

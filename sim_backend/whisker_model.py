@@ -58,7 +58,8 @@ class ContactModel:
     Attributes:
         time_constant: of the normal direction, s; at least twice the time step.
         friction_time_constant: of the tangential directions, s.
-        friction: Coulomb's coefficient, steel on rock.
+        friction: Coulomb's coefficient, a rounded steel tip on rock. The driver's reversals turn rods over: those
+            steeper than atan(friction) jam instead.
         impedance: MuJoCo's solimp d0, dwidth, width.
         margin: thickness of the layer in which a contact's force builds up, m.
         cone_ratio: MuJoCo's impratio; 3 lets sliding reach Coulomb's limit in spite of the slow reference.
@@ -66,7 +67,7 @@ class ContactModel:
 
     time_constant: float = 0.008
     friction_time_constant: float = 0.04
-    friction: float = 0.5
+    friction: float = 0.3
     impedance: tuple[float, float, float] = (0.8, 0.95, 0.002)
     margin: float = 0.0004
     cone_ratio: float = 3.0
@@ -77,6 +78,8 @@ class ContactModel:
 #: which makes a step two to three times slower.
 CARRIER_MASS = 100.0
 GEOM_PREFIX = "whisker"
+#: The ground under a whisker's tip: a plane that `physics` keeps tangent to it (the n-th mocap body).
+GROUND_PREFIX = "ground_under_"
 
 
 def build(
@@ -86,8 +89,14 @@ def build(
     contact: ContactModel,
     time_step: float,
 ) -> mujoco.MjModel:
-    """The compiled model. Joint order: for each whisker a free joint, then the hinges about its x and y axes."""
-    statics, static_names = _world_geoms(world)
+    """The compiled model.
+
+    Joints: for each whisker a free joint, then the hinges about its x and y axes. Mocap bodies: for each whisker
+    the plane of the ground under its tip. The height field itself is only there to be looked at: MuJoCo collides
+    with the prisms of its cells one by one, and a rod that a reversal pressed deeper than the distance to a
+    prism's side is then held there, by contacts that push sideways, for good.
+    """
+    solids = _solids(world)
     whiskers = [_whisker(i, layout, mechanics) for i in range(layout.count)]
     solref = f"{contact.time_constant} 1"
     parameters = (
@@ -96,13 +105,19 @@ def build(
         f'solimp="{" ".join(map(str, contact.impedance))}"'
     )
     pairs = [
-        f'<pair geom1="{static}" geom2="{GEOM_PREFIX}{i}" {parameters}/>'
-        for static in static_names
+        f'<pair geom1="{other}" geom2="{GEOM_PREFIX}{i}" {parameters}/>'
+        for i in np.flatnonzero(layout.present)
+        for other in (f"{GROUND_PREFIX}{i}", *(solid.name for solid in world.solids))
+    ]
+    planes = [
+        f'<body mocap="true" pos="0 0 -10"><geom name="{GROUND_PREFIX}{i}" type="plane" size="0.01 0.01 0.01" '
+        f'contype="0" conaffinity="0" rgba="0 0 0 0"/></body>'
         for i in range(layout.count)
     ]
     ny, nx = world.ground.z.shape
-    low, high = float(world.ground.z.min()), float(world.ground.z.max())
     (x0, x1), (y0, y1) = world.ground.extent
+    z = world.ground.height(*np.meshgrid(np.linspace(x0, x1, nx), np.linspace(y0, y1, ny)))
+    low, high = float(z.min()), float(z.max())
     size = f"{(x1 - x0) / 2} {(y1 - y0) / 2} {max(high - low, 1e-6)} 0.1"
     model = mujoco.MjModel.from_xml_string(
         f"""<mujoco model="{world.name}">
@@ -116,21 +131,20 @@ def build(
         <light pos="1.5 0.5 3" dir="0 0.2 -1" castshadow="true"/>
         <geom name="ground" type="hfield" hfield="ground" pos="{(x0 + x1) / 2} {(y0 + y1) / 2} {low}"
           contype="0" conaffinity="0" rgba="0.62 0.55 0.45 1"/>
-        {"".join(statics)}{"".join(whiskers)}
+        {"".join(solids)}{"".join(planes)}{"".join(whiskers)}
         </worldbody>
         <contact>{"".join(pairs)}</contact></mujoco>"""
     )
-    model.hfield_data[:] = ((world.ground.z - low) / max(high - low, 1e-6)).ravel()
+    model.hfield_data[:] = ((z - low) / max(high - low, 1e-6)).ravel()
     return model
 
 
-def _world_geoms(world: World) -> tuple[list[str], list[str]]:
-    geoms = [
+def _solids(world: World) -> list[str]:
+    return [
         f'<geom name="{s.name}" type="{s.shape}" size="{_text(s.size)}" pos="{_text(s.centre)}" '
         f'quat="{_text(s.quaternion_wxyz())}" contype="0" conaffinity="0" rgba="0.45 0.42 0.5 1"/>'
         for s in world.solids
     ]
-    return geoms, ["ground", *(s.name for s in world.solids)]
 
 
 def _whisker(i: int, layout: WhiskerLayout, mechanics: WhiskerMechanics) -> str:

@@ -92,15 +92,18 @@ class TestWrapAngle:
     @given(st.floats(-1e4, 1e4))
     def test_stays_in_range_and_keeps_the_direction(self, angle):
         wrapped = float(g.wrap_angle(angle))
-        assert -np.pi <= wrapped <= np.pi + 1e-15
+        assert -np.pi < wrapped <= np.pi
         np.testing.assert_allclose([np.cos(wrapped), np.sin(wrapped)], [np.cos(angle), np.sin(angle)], atol=1e-11)
 
     @given(st.floats(-np.pi, np.pi, exclude_min=True))
     def test_angles_inside_stay_as_they_are_to_the_bit(self, angle):
         assert float(g.wrap_angle(angle)) == angle
 
-    def test_minus_pi_becomes_pi(self):
-        assert float(g.wrap_angle(-np.pi)) == np.pi
+    @pytest.mark.parametrize("turns", [-1.0, 1.0, 3.0, -5.0])
+    def test_half_turns_become_pi(self, turns):
+        for angle in (turns * np.pi, np.nextafter(turns * np.pi, np.sign(turns) * np.inf)):
+            assert abs(float(g.wrap_angle(angle))) == pytest.approx(np.pi, abs=1e-14)
+        assert float(g.wrap_angle(turns * np.pi)) == np.pi
 
 
 class TestMotionsInSpace:

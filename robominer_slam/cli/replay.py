@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import click
+from rich.console import Console
 from rich.progress import Progress
 
 from robominer_slam.evaluation.trajectory import tum_line
@@ -41,7 +42,7 @@ def replay(
     with contextlib.ExitStack() as stack:
         poses = stack.enter_context(tum.open("w", encoding="utf-8")) if tum else None
         odometry = stack.enter_context(odometry_tum.open("w", encoding="utf-8")) if odometry_tum else None
-        progress = stack.enter_context(Progress(transient=True, disable=None if not as_json else True))
+        progress = stack.enter_context(Progress(console=Console(stderr=True), transient=True, disable=as_json))
         task = progress.add_task(file.name, total=max(inputs.recording.duration_ns, 1))
         first: list[int] = []
 

@@ -65,7 +65,8 @@ def _line(where: str, error: Any) -> str:  # noqa: ANN401 - pydantic's ErrorDeta
     if kind == "tuple_type":
         message = "a list, as in [...]"
     message = message if message.startswith("expected") else f"expected {message}"
-    return f"{where}: {key}: {message}{f' {unit}' if unit not in ('', '1') else ''}{shown}"
+    suffix = "" if unit in ("", "1") else f" in {unit}" if message.endswith("a number") else f" {unit}"
+    return f"{where}: {key}: {message}{suffix}{shown}"
 
 
 def _find(location: tuple[int | str, ...]) -> tuple[type[BaseModel] | None, FieldInfo | None]:

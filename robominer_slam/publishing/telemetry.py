@@ -60,6 +60,7 @@ class TelemetryError(ValueError):
 class Health(IntFlag):
     """What is wrong; 0: nothing."""
 
+    FINE = 0
     WHISKERS_SILENT = 1
     IMU_SILENT = 2
     SCREWS_SILENT = 4
@@ -98,7 +99,7 @@ class Telemetry:
     contacts: int
     inclination: FloatArray
     azimuth: FloatArray
-    health: Health = Health(0)
+    health: Health = Health.FINE
     map_version: int = 0
     keyframes: int = 0
     closures: int = 0

@@ -365,10 +365,10 @@ class PoseGraph:
         shape = (3,) if self.dim == 2 else (4, 4)
         if p.ndim != 1 + len(shape) or p.shape[1:] != shape or count not in (None, p.shape[0]):
             raise PoseGraphError(f"{what}: shape {p.shape}; expected ({'k' if count is None else count}, *{shape})")
-        good = np.isfinite(p).reshape(p.shape[0], -1).all(axis=1)
+        good = np.isfinite(p).all(axis=tuple(range(1, p.ndim)))
         if self.dim == 3:
             R = p[:, :3, :3]
-            off = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).reshape(p.shape[0], 9).max(axis=1, initial=0.0)
+            off = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
             good &= (off < 1e-6) & (np.linalg.det(R) > 0.0)
         for k in np.flatnonzero(~good)[:1]:
             raise PoseGraphError(f"{what} {k} of those added is not a finite pose with a proper rotation")
@@ -381,8 +381,8 @@ class PoseGraph:
         if not np.isfinite(Omega).all():
             raise PoseGraphError("information: a number is not finite; expected a finite symmetric matrix")
         transposed = np.swapaxes(Omega, -1, -2)
-        scale = np.abs(Omega).reshape(count, -1).max(axis=1, initial=0.0)
-        skew = np.abs(Omega - transposed).reshape(count, -1).max(axis=1, initial=0.0)
+        scale = np.abs(Omega).max(axis=(1, 2), initial=0.0)
+        skew = np.abs(Omega - transposed).max(axis=(1, 2), initial=0.0)
         Omega = 0.5 * (Omega + transposed)
         least = np.linalg.eigvalsh(Omega)[:, 0]
         for k in np.flatnonzero((skew > 1e-9 * scale) | (least < -1e-9 * scale) | (scale == 0.0))[:1]:

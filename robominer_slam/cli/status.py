@@ -1,0 +1,57 @@
+"""`robominer-slam status`: what a running daemon says of itself."""
+
+from __future__ import annotations
+
+import json
+import queue
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.table import Table
+
+from drivers.ros_messages import deserialize
+from robominer_slam.publishing.report_messages import DIAGNOSTIC_ARRAY, Level
+from robominer_slam.publishing.zenoh_session import ZenohBus, ZenohSettings
+
+COLOURS = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "red", Level.STALE: "magenta"}
+
+
+@click.command(epilog="Example: robominer-slam status --connect tcp/127.0.0.1:7447")
+@click.option("--connect", default="tcp/127.0.0.1:7447", show_default=True, help="Endpoint of the daemon.")
+@click.option("--robot", default="rm3", show_default=True, help="The robot's id.")
+@click.option("--timeout", default=5.0, show_default=True, help="How long to wait for an answer, s.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def status(connect: str, robot: str, timeout: float, as_json: bool) -> None:
+    """What a running daemon says of itself; it speaks once a second."""
+    messages: queue.Queue[bytes] = queue.Queue()
+    settings = ZenohSettings(connect=(connect,), mode="client", connect_timeout_s=timeout)
+    with ZenohBus(settings, f"robominer/{robot}") as bus:
+        bus.subscriber("status", lambda received: messages.put(received.payload))
+        try:
+            payload = messages.get(timeout=timeout)
+        except queue.Empty:
+            raise click.ClickException(
+                f"nothing on robominer/{robot}/status within {timeout:g} s: is the robot's id right?"
+            ) from None
+    entries: list[Any] = list(deserialize(payload, DIAGNOSTIC_ARRAY).status)
+    if as_json:
+        described = [
+            {
+                "name": entry.name,
+                "level": Level(entry.level).name,
+                "message": entry.message,
+                "values": {value.key: value.value for value in entry.values},
+            }
+            for entry in entries
+        ]
+        click.echo(json.dumps(described))
+        return
+    table = Table(title=f"robominer/{robot}")
+    for column in ("part", "level", "says", "figures"):
+        table.add_column(column)
+    for entry in entries:
+        level = Level(entry.level)
+        figures = "\n".join(f"{value.key} = {value.value}" for value in entry.values if value.value)
+        table.add_row(entry.name, f"[{COLOURS[level]}]{level.name}[/]", entry.message, figures)
+    Console().print(table)

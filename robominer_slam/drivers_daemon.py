@@ -1,0 +1,37 @@
+"""The daemon in role `drivers`: this board's devices onto the network, for a board that does the SLAM."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+
+from robominer_slam import status_report
+from robominer_slam.publishing import report_messages
+from robominer_slam.publishing.zenoh_session import ZenohBus
+from robominer_slam.sources.source import MeasurementSource
+from robominer_slam.sources.zenoh_source import publish_raw
+from robominer_slam.wall_clock import WallClock
+
+log = logging.getLogger(__name__)
+
+STATUS_INTERVAL_S = 1.0
+WAIT_S = 0.1
+
+
+def forward(source: MeasurementSource, bus: ZenohBus, stop: threading.Event) -> None:
+    """Publish every measurement on `raw/<device>` and the devices' state on `status`, until `stop` is set."""
+    clock = WallClock()
+    forwarded = 0
+    next_status = time.monotonic()
+    while not stop.is_set():
+        item = source.get(WAIT_S)
+        if item is not None:
+            publish_raw(bus, clock, *item)
+            forwarded += 1
+        if time.monotonic() >= next_status:
+            next_status += STATUS_INTERVAL_S
+            entries = [status_report.process_diagnostic(clock, source.dropped)]
+            entries += [status_report.device_diagnostic(device) for device in source.status()]
+            bus.put("status", report_messages.diagnostics(clock.now_unix_ns(), entries))
+    log.info("ended after %d measurements", forwarded)

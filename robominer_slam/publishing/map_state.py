@@ -1,0 +1,118 @@
+"""The map as the map stream carries it: keyframes with quantised poses and points, and the state's digest.
+
+Both ends hold exactly this, so that a digest can say whether they hold the same. See docs/map-stream.md.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from robominer_slam import geometry
+
+FloatArray = NDArray[np.float64]
+PointArray = NDArray[np.int16]
+
+MILLIMETRES_PER_METRE = 1000.0
+#: A quaternion's component of 1.
+QUATERNION_UNIT = 32767.0
+DIGEST_BYTES = 8
+#: x y z in mm, qx qy qz qw in 1/32767.
+POSE = struct.Struct("<3i4h")
+_POINTS_DIGEST_BYTES = 16
+_STATE_HEAD = struct.Struct("<QII")
+_KEYFRAME_HEAD = struct.Struct("<IqI")
+
+
+@dataclass(frozen=True, slots=True)
+class StreamKeyframe:
+    """A keyframe as it travels.
+
+    Attributes:
+        stamp_ns: UNIX time.
+        pose: T_map_base as x y z (mm), qx qy qz qw (1/32767), with qw >= 0.
+        points: shape (m, 3), mm, in base_link at the keyframe; every point once, sorted by x, y, z.
+        points_digest: of the points.
+    """
+
+    stamp_ns: int
+    pose: tuple[int, ...]
+    points: PointArray
+    points_digest: bytes
+
+    def vector7(self) -> FloatArray:
+        """T_map_base as x y z (m), qx qy qz qw of length 1; shape (7,)."""
+        values = np.array(self.pose, dtype=np.float64)
+        values[:3] /= MILLIMETRES_PER_METRE
+        values[3:] /= np.linalg.norm(values[3:])
+        return values
+
+    def points_m(self) -> FloatArray:
+        """Points in base_link at the keyframe, shape (m, 3), m."""
+        return self.points / MILLIMETRES_PER_METRE
+
+
+@dataclass(slots=True)
+class MapState:
+    """A map at a version; the empty map has version 0."""
+
+    map_id: int
+    version: int = 0
+    keyframes: dict[int, StreamKeyframe] = field(default_factory=dict)
+
+    def digest(self) -> bytes:
+        """BLAKE2b of 8 bytes over the whole state, independent of how it came about."""
+        state = hashlib.blake2b(digest_size=DIGEST_BYTES)
+        state.update(_STATE_HEAD.pack(self.map_id, self.version, len(self.keyframes)))
+        for key in sorted(self.keyframes):
+            keyframe = self.keyframes[key]
+            head = _KEYFRAME_HEAD.pack(key, keyframe.stamp_ns, len(keyframe.points))
+            state.update(head + POSE.pack(*keyframe.pose) + keyframe.points_digest)
+        return state.digest()
+
+    def cloud(self) -> FloatArray:
+        """All points in map, shape (m, 3), m."""
+        parts = [
+            geometry.transform_points(geometry.from_vector7(keyframe.vector7()), keyframe.points_m())
+            for keyframe in self.keyframes.values()
+        ]
+        return np.concatenate(parts) if parts else np.zeros((0, 3))
+
+
+def keyframe(stamp_ns: int, pose: tuple[int, ...], points: PointArray) -> StreamKeyframe:
+    """A keyframe with the digest of its points, which are taken as they are."""
+    data = np.ascontiguousarray(points, dtype="<i2").tobytes()
+    digest = hashlib.blake2b(data, digest_size=_POINTS_DIGEST_BYTES).digest()
+    return StreamKeyframe(stamp_ns, pose, points, digest)
+
+
+def quantise_poses(poses: ArrayLike) -> NDArray[np.int32]:
+    """Poses x y z (m), qx qy qz qw, shape (n, 7), in the stream's units, with qw >= 0.
+
+    Raises:
+        ValueError: a number that is not finite.
+    """
+    values = np.array(poses, dtype=np.float64).reshape(-1, 7)
+    if not np.isfinite(values).all():
+        raise ValueError("a keyframe's pose is not finite")
+    values[:, 3:] /= np.linalg.norm(values[:, 3:], axis=1, keepdims=True)
+    values[values[:, 6] < 0.0, 3:] *= -1.0
+    values[:, :3] *= MILLIMETRES_PER_METRE
+    values[:, 3:] *= QUATERNION_UNIT
+    return np.rint(values).astype(np.int32)
+
+
+def quantise_points(points: ArrayLike) -> tuple[PointArray, int]:
+    """Points (m, 3), m, in the stream's units, each once and sorted; and how many had to be left out.
+
+    Left out is what is not finite or farther than 32.767 m from the keyframe along an axis.
+    """
+    values = np.rint(np.asarray(points, dtype=np.float64).reshape(-1, 3) * MILLIMETRES_PER_METRE)
+    usable = (np.abs(values) <= np.iinfo(np.int16).max).all(axis=1)
+    kept = values[usable].astype(np.int16)
+    unique = np.unique(kept, axis=0).reshape(-1, 3)
+    return unique, len(values) - len(kept)

@@ -1,0 +1,53 @@
+"""Opens what the configured role needs (devices, network, store) and runs the daemon of that role."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from pathlib import Path
+
+from drivers.serial_reader import SerialReader
+from robominer_slam.configuration.array import calibrated_array
+from robominer_slam.configuration.devices import device_settings
+from robominer_slam.configuration.file import ConfigurationError
+from robominer_slam.configuration.model import Configuration
+from robominer_slam.daemon import Daemon
+from robominer_slam.drivers_daemon import forward
+from robominer_slam.publishing.zenoh_session import ZenohBus, ZenohSettings
+from robominer_slam.sources.source import MeasurementSource
+from robominer_slam.sources.zenoh_source import ZenohSource
+from robominer_slam.store import MapStore
+from robominer_slam.wall_clock import WallClock
+
+
+def serve(configuration: Configuration, config_file: Path, stop: threading.Event) -> None:
+    """Run until `stop` is set.
+
+    Args:
+        configuration: the effective one.
+        config_file: where it came from: relative paths in it start there.
+        stop: set by SIGTERM and SIGINT.
+
+    Raises:
+        ConfigurationError and the other errors of a user's mistake, before anything runs.
+    """
+    robot, folder = configuration.robot, config_file.parent
+    if robot.role != "slam" and not configuration.device:
+        raise ConfigurationError(f"{config_file}: device: missing; expected a [[device]] for each port")
+    settings = ZenohSettings(listen=configuration.zenoh.listen, connect=configuration.zenoh.connect)
+    prefix = f"robominer/{robot.id}"
+    with contextlib.ExitStack() as stack:
+        if robot.role == "drivers":
+            reader = SerialReader(device_settings(configuration))
+            bus = stack.enter_context(ZenohBus(settings, prefix))
+            forward(stack.enter_context(reader), bus, stop)
+            return
+        array = calibrated_array(configuration, folder)
+        store = MapStore(folder / configuration.store.path, configuration.store.sync_s, robot.id, "")
+        bus = stack.enter_context(ZenohBus(settings, prefix))
+        stack.enter_context(store)
+        source: MeasurementSource = (
+            ZenohSource(bus, WallClock()) if robot.role == "slam" else SerialReader(device_settings(configuration))
+        )
+        stack.enter_context(source)
+        Daemon(configuration, array, source, bus, store).run(stop)

@@ -1,0 +1,115 @@
+"""The tree is the architecture: who may import what."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("drivers", "calibration", "robominer_slam", "sim_backend")
+
+#: Modules that read or write anything: devices, files, networks, databases, terminals.
+IO_MODULES = {
+    "serial", "usb", "zenoh", "sqlite3", "sqlite_utils", "socket", "selectors", "subprocess", "mcap", "click", "rich",
+    "pathlib", "shutil", "tempfile", "io", "os", "matplotlib",
+}  # fmt: skip
+
+#: Folders and files that compute and do nothing else.
+PURE = (
+    "calibration",
+    "robominer_slam/contacts.py",
+    "robominer_slam/estimation",
+    "robominer_slam/frame_result.py",
+    "robominer_slam/geometry.py",
+    "robominer_slam/layout.py",
+    "robominer_slam/mapping",
+    "robominer_slam/pipeline.py",
+    "robominer_slam/reorder.py",
+    "robominer_slam/slam",
+    "robominer_slam/evaluation/metrics.py",
+    "robominer_slam/evaluation/pose_graph_errors.py",
+    "robominer_slam/evaluation/trajectory.py",
+    "drivers/clock.py",
+    "drivers/device.py",
+    "drivers/framed.py",
+    "drivers/measurement.py",
+    "drivers/readings.py",
+)
+
+#: What the algorithms may take from the drivers: the type of a measurement.
+DRIVERS_FOR_ALGORITHMS = {"drivers.measurement"}
+ALGORITHMS = ("calibration", "robominer_slam/estimation", "robominer_slam/slam", "robominer_slam/mapping")
+
+
+def imports(path: Path) -> set[str]:
+    """Full names of the modules that a file imports, also inside functions."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found.add(node.module)
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def files(place: str) -> list[Path]:
+    path = ROOT / place
+    found = sorted(path.rglob("*.py")) if path.is_dir() else [path]
+    assert found, place
+    return found
+
+
+def packages_of(names: set[str]) -> set[str]:
+    return {name.split(".")[0] for name in names}
+
+
+@pytest.mark.parametrize("place", PURE)
+def test_algorithms_import_no_io(place: str):
+    for path in files(place):
+        wrong = packages_of(imports(path)) & IO_MODULES
+        assert not wrong, f"{path.relative_to(ROOT)} imports {wrong}"
+
+
+def test_drivers_know_nothing_of_slam():
+    for path in files("drivers"):
+        assert not packages_of(imports(path)) & {"robominer_slam", "calibration", "sim_backend"}, path
+
+
+def test_calibration_stands_alone():
+    for path in files("calibration"):
+        assert not packages_of(imports(path)) & {"robominer_slam", "drivers", "sim_backend"}, path
+
+
+def test_nothing_outside_the_simulator_imports_it():
+    for package in ("drivers", "calibration", "robominer_slam"):
+        for path in files(package):
+            assert "sim_backend" not in packages_of(imports(path)), path
+
+
+def test_algorithms_take_only_measurements_from_the_drivers():
+    for place in ALGORITHMS:
+        for path in files(place):
+            used = {name for name in imports(path) if name.startswith("drivers.")}
+            used = {".".join(name.split(".")[:2]) for name in used}
+            assert used <= DRIVERS_FOR_ALGORITHMS, f"{path.relative_to(ROOT)} imports {used}"
+
+
+def test_the_simulator_shares_no_code_with_the_decoders():
+    for path in files("sim_backend"):
+        wrong = {name for name in imports(path) if name.startswith(("drivers.framed", "drivers.readings"))}
+        assert not wrong, f"{path.relative_to(ROOT)} imports {wrong}"
+
+
+def test_simulation_only_libraries_stay_in_the_simulator():
+    for package in ("drivers", "calibration", "robominer_slam"):
+        for path in files(package):
+            assert not packages_of(imports(path)) & {"mujoco", "magpylib"}, path
+
+
+def test_development_oracles_are_not_used_by_the_program():
+    for package in PACKAGES:
+        for path in files(package):
+            assert not packages_of(imports(path)) & {"evo", "gtsam", "hypothesis", "pytest", "mcap_ros2"}, path

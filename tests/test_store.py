@@ -1,0 +1,107 @@
+"""The store: what was added is on the disk, whatever comes."""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+
+import numpy as np
+import pytest
+
+from robominer_slam import geometry
+from robominer_slam.pipeline import planar
+from robominer_slam.slam.keyframe import BackendResult, GraphEdge, Keyframe
+from robominer_slam.store import MapStore, StoreError, open_database, pack_points, unpack_points
+
+
+def result(k: int) -> BackendResult:
+    poses = np.array([planar(0.1 * i, 0.0, 0.0) for i in range(k + 1)])
+    edges = [GraphEdge("odometry", i, i + 1, planar(0.1, 0, 0), np.eye(6), 1.0) for i in range(k)]
+    points = np.random.default_rng(k).uniform(-0.4, 0.4, (300, 3))
+    keyframe = Keyframe(k, 1000 + k, poses[k], points, 0.1 * k)
+    return BackendResult(keyframe, np.eye(4), poses, np.zeros((3, 3)), edges, 0, k + 1)
+
+
+def rows(path, query: str) -> list[tuple]:
+    connection = sqlite3.connect(path)
+    try:
+        return connection.execute(query).fetchall()
+    finally:
+        connection.close()
+
+
+def test_keyframes_and_edges_are_stored_with_their_poses(tmp_path):
+    path = tmp_path / "sub" / "map.db"
+    with MapStore(path, 0.2, "rm3", "first") as store:
+        for k in range(5):
+            store.add(result(k), 7)
+        assert store.flush(5.0)
+        store.save_poses(np.array([planar(0, 1.0 * i, 0) for i in range(5)]))
+        store.rename("gallery")
+    assert rows(path, "SELECT name, robot FROM maps") == [("gallery", "rm3")]
+    stored = rows(path, "SELECT id, stamp_unix_ns, T_map_base, points FROM keyframes ORDER BY id")
+    assert [(row[0], row[1]) for row in stored] == [(k, 1007 + k) for k in range(5)]
+    np.testing.assert_allclose(np.frombuffer(stored[3][2]), geometry.to_vector7(planar(0, 3.0, 0)))
+    np.testing.assert_allclose(unpack_points(stored[3][3]), result(3).keyframe.points, atol=6e-4)
+    assert rows(path, "SELECT kind, i, j FROM edges ORDER BY j") == [("odometry", i, i + 1) for i in range(4)]
+
+
+def test_a_keyframe_is_on_the_disk_within_the_promised_time(tmp_path):
+    path = tmp_path / "map.db"
+    with MapStore(path, 1.0, "rm3", "") as store:
+        store.add(result(0), 0)
+        end = time.monotonic() + 1.0
+        while not rows(path, "SELECT id FROM keyframes"):
+            assert time.monotonic() < end, "not on the disk after sync_s"
+
+
+def test_each_run_is_a_map_of_its_own(tmp_path):
+    for _ in range(2):
+        with MapStore(tmp_path / "map.db", 0.1, "rm3", "") as store:
+            store.add(result(0), 0)
+    assert rows(tmp_path / "map.db", "SELECT map_id, id FROM keyframes") == [(1, 0), (2, 0)]
+
+
+def test_a_newer_database_is_refused_and_left_alone(tmp_path):
+    path = tmp_path / "map.db"
+    open_database(path).close()
+    connection = sqlite3.connect(path)
+    connection.execute("PRAGMA user_version = 99")
+    connection.close()
+    with pytest.raises(StoreError, match="schema version 99"):
+        open_database(path)
+    assert rows(path, "PRAGMA user_version") == [(99,)]
+
+
+def test_what_is_no_database_is_refused_with_one_line(tmp_path):
+    path = tmp_path / "map.db"
+    path.write_bytes(b"this is not a database, it is a letter" * 100)
+    with pytest.raises(StoreError, match="not a database") as error:
+        open_database(path)
+    assert "\n" not in str(error.value)
+    with pytest.raises(StoreError, match="writable folder"):
+        open_database(path / "below" / "map.db")
+
+
+def test_a_locked_database_is_reported_and_nothing_is_lost(tmp_path):
+    path = tmp_path / "map.db"
+    with MapStore(path, 0.1, "rm3", "") as store:
+        store._connection.execute("PRAGMA busy_timeout = 10")
+        other = sqlite3.connect(path, isolation_level=None)
+        other.execute("BEGIN IMMEDIATE")
+        store.add(result(0), 0)
+        end = time.monotonic() + 5
+        while not store.fault and time.monotonic() < end:
+            store.flush(0.1)
+        assert "locked" in store.fault
+        other.execute("ROLLBACK")
+        other.close()
+        store.add(result(1), 0)
+        assert store.flush(5.0)
+        assert store.fault == ""
+    assert rows(path, "SELECT id FROM keyframes") == [(0,), (1,)]
+
+
+def test_points_survive_packing_to_a_millimetre():
+    points = np.random.default_rng(0).uniform(-1, 1, (500, 3))
+    np.testing.assert_allclose(unpack_points(pack_points(points)), points, atol=5.01e-4)
