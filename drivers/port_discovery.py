@@ -23,9 +23,7 @@ def parse_usb(name: str) -> tuple[int, int, str | None]:
             raise ValueError
         return int(parts[1], 16), int(parts[2], 16), parts[3] if len(parts) == 4 else None
     except ValueError:
-        raise PortNameError(
-            f"port {name!r}: expected usb:VID:PID or usb:VID:PID:SERIAL with hexadecimal ids"
-        ) from None
+        raise PortNameError(f"port {name!r}: expected usb:VID:PID or usb:VID:PID:SERIAL with hexadecimal ids") from None
 
 
 def check_port_name(name: str) -> None:

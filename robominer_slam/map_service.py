@@ -80,7 +80,7 @@ class MapService:
 
     def snapshot(self) -> list[Reply]:
         """The whole stream state, in messages of a few KB."""
-        return [Reply(message) for message in self._stream.snapshot()]
+        return [Reply(payload) for payload in self._stream.snapshot_payloads()]
 
     def cloud(self) -> list[Reply]:
         """PointCloud2 of the map."""

@@ -115,8 +115,6 @@ def random_ground(
     z = np.zeros((len(y), len(x)))
     for length, angle, start in zip(wavelength, direction, phase, strict=True):
         k = 2.0 * np.pi / length
-        z += length**spectrum.exponent * np.cos(
-            k * (np.cos(angle) * x[None, :] + np.sin(angle) * y[:, None]) + start
-        )
+        z += length**spectrum.exponent * np.cos(k * (np.cos(angle) * x[None, :] + np.sin(angle) * y[:, None]) + start)
     z -= z.min()
     return HeightField((x0, y0), cell, z * (spectrum.relief / z.max()))

@@ -145,9 +145,7 @@ class PhysicsEngine:
         direction = rod_direction(angles)
         inclination = np.arctan2(np.hypot(direction[:, 0], direction[:, 1]), direction[:, 2])
         azimuth = np.arctan2(direction[:, 1], direction[:, 0])
-        return ArrayReading(
-            time, inclination, azimuth, angles, contact[self._nearest, each], self._depth.copy()
-        )
+        return ArrayReading(time, inclination, azimuth, angles, contact[self._nearest, each], self._depth.copy())
 
     def tips(self) -> FloatArray:
         """Positions of the rods' ends now, shape (n, 3), m, in the map frame."""
@@ -209,4 +207,3 @@ class PhysicsEngine:
         contact[:, who[pressed]] = True
         self._depth[:] = np.nan
         np.fmax.at(self._depth, who, -found.dist[outside])
-

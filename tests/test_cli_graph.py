@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from robominer_slam.cli.graph import graph
 from robominer_slam.slam.g2o_format import G2oGraph, format_g2o, parse_g2o
 from robominer_slam.slam.pose_graph import PoseGraph
-from tests.test_pose_graph import PUBLIC_OPTIMA, grid_3d, ring
+from tests.pose_graph_problems import PUBLIC_OPTIMA, grid_3d, ring
 
 
 def as_text(pose_graph: PoseGraph) -> str:
@@ -84,7 +84,7 @@ def test_fix_lines_hold_other_nodes_than_the_first(tmp_path):
         ("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 0 0 0\n", "in.g2o: node 1 is not joined to a fixed node"),
         (
             "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 0 0 0\nEDGE_SE2 0 1 0 0 0 -1 0 0 1 0 1\n",
-            "in.g2o: information matrix 0 of those added is not symmetric and positive",
+            "in.g2o: information matrix 0 of those given is not symmetric and positive",
         ),
         ("", "in.g2o: no node"),
     ],

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
+import struct
+import zlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -211,6 +214,41 @@ def test_a_restarted_sender_and_a_new_map_need_no_snapshot() -> None:
     # A late copy of the first stream's first update, which fits any empty map, leads nowhere.
     assert not decoder.feed(first[0])
     assert_same(decoder.state, streams[-1].state)
+
+
+def test_a_snapshot_goes_in_one_payload_while_it_fits() -> None:
+    world, encoder = World(2, points=3000), MapStreamEncoder(MAP_ID)
+    for _ in range(12):
+        world.step()
+        world.update(encoder)
+    [whole] = encoder.snapshot_payloads()
+    pieces = encoder.snapshot_payloads(max_bytes=20_000)
+    assert len(pieces) > 1
+    assert max(len(piece) for piece in pieces) <= 20_000
+    for payloads in ([whole], pieces):
+        decoder = MapStreamDecoder()
+        assert [decoder.feed(payload) for payload in payloads] == [False] * (len(payloads) - 1) + [True]
+        assert_same(decoder.state, encoder.state)
+
+
+def test_the_bytes_lie_as_documented() -> None:
+    """Read with nothing but docs/map-stream.md."""
+    encoder = MapStreamEncoder(MAP_ID)
+    cloud = np.array([[0.002, -0.003, 0.004], [0.001, 0.005, 0.0]])
+    [message] = encoder.update(9, [Source(5, STAMP, cloud)], np.array([[1.5, -2.0, 0.25, 0, 0, 0.6, 0.8]]))
+    magic, form, kind, size, map_id, _, base, version, part, parts, digest = struct.unpack_from(
+        "<4sBBHQIIIHH8s", message
+    )
+    assert (magic, form, kind, map_id, base, version, part, parts) == (b"RMAP", 1, 1, MAP_ID, 0, 9, 0, 1)
+    assert len(message) == 40 + size
+    body = zlib.decompress(message[40:])
+    pose = struct.pack("<3i4h", 1500, -2000, 250, 0, 0, round(0.6 * 32767), round(0.8 * 32767))
+    keyframe = struct.pack("<BIqI", 1, 5, STAMP, 2) + pose
+    points = struct.pack("<BIH6h", 2, 5, 2, 1, 1, 5, -3, 0, 4)
+    assert body == keyframe + points
+    rows = hashlib.blake2b(struct.pack("<6h", 1, 5, 0, 2, -3, 4), digest_size=16).digest()
+    state = struct.pack("<QII", MAP_ID, 9, 1) + struct.pack("<IqI", 5, STAMP, 2) + pose + rows
+    assert digest == hashlib.blake2b(state, digest_size=8).digest()
 
 
 def test_a_snapshot_of_the_empty_map_is_one_message() -> None:

@@ -240,9 +240,9 @@ def test_poses_and_transforms_are_read_by_an_independent_decoder() -> None:
 
 def test_a_whole_distributions_store_reads_the_packed_messages() -> None:
     """Not only our own reduced store."""
-    jazzy = get_typestore(Stores.ROS2_JAZZY)
+    humble = get_typestore(Stores.ROS2_HUMBLE)
     pose = np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0])
     data = pose_messages.odometry(STAMP, "odom", "base_link", pose, np.eye(6), np.arange(6.0), 2 * np.eye(6))
-    message = jazzy.deserialize_cdr(data, pose_messages.ODOMETRY)
+    message = humble.deserialize_cdr(data, pose_messages.ODOMETRY)
     assert (message.child_frame_id, message.twist.twist.angular.z) == ("base_link", 5.0)
     assert message.twist.covariance[7] == 2.0

@@ -68,7 +68,7 @@ _QOS = {
     "whiskers/points": Qos(zenoh.Priority.INTERACTIVE_LOW),
     "status": Qos(zenoh.Priority.DATA_HIGH),
     "path": Qos(zenoh.Priority.DATA_LOW),
-    "map/updates": Qos(zenoh.Priority.DATA_LOW, cache=64),
+    "map/updates": Qos(zenoh.Priority.DATA_LOW, cache=256),
 }
 #: Raw sensors for a board that does the SLAM: late ones are of no use to it.
 _RAW = Qos(zenoh.Priority.INTERACTIVE_HIGH, express=True)

@@ -32,6 +32,8 @@ FloatArray = NDArray[np.float64]
 #: Poses that moved less than this against what was sent last are not sent again, m and rad.
 POSITION_TOLERANCE = 0.002
 ANGLE_TOLERANCE = 0.001
+#: Of an answer to a query: well below what receivers refuse (1 MiB).
+MAX_PAYLOAD_BYTES = 512 * 1024
 
 
 class SourceKeyframe(Protocol):
@@ -104,11 +106,20 @@ class MapStreamEncoder:
         return self._messages(Kind.UPDATE, base, records)
 
     def snapshot(self) -> list[bytes]:
-        """The messages that carry the whole state; concatenated they may go as one payload."""
+        """The messages that carry the whole state."""
         records: list[Record] = []
         for key in sorted(self.state.keyframes):
             records += _new_keyframe(key, self.state.keyframes[key])
         return self._messages(Kind.SNAPSHOT, 0, records)
+
+    def snapshot_payloads(self, max_bytes: int = MAX_PAYLOAD_BYTES) -> list[bytes]:
+        """The snapshot's messages, concatenated: one payload but for large maps."""
+        payloads = [b""]
+        for message in self.snapshot():
+            if len(payloads[-1]) + len(message) > max_bytes:
+                payloads.append(b"")
+            payloads[-1] += message
+        return payloads
 
     def _take(self, source: SourceKeyframe, pose: tuple[int, ...], clock_offset_ns: int) -> Iterable[Record]:
         known = self.state.keyframes.get(source.id)

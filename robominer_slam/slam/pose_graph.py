@@ -13,29 +13,27 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from robominer_slam import geometry
 from robominer_slam.geometry import FloatArray
 from robominer_slam.slam import pose_graph_residuals as residuals
 from robominer_slam.slam.growing_array import GrowingArray
-from robominer_slam.slam.pose_graph_optimizer import (
-    Kernels,
-    OptimizationOptions,
-    edge_costs,
-    minimise,
-    normal_equations,
+from robominer_slam.slam.pose_graph_covariance import joint_covariance
+from robominer_slam.slam.pose_graph_input import (
+    PoseGraphError,
+    check_ends,
+    check_joined,
+    checked_information,
+    checked_poses,
 )
+from robominer_slam.slam.pose_graph_optimizer import Kernels, OptimizationOptions, edge_costs, minimise
 from robominer_slam.slam.pose_graph_residuals import Convention, EdgeArrays
 from robominer_slam.slam.pose_graph_system import SingularSystemError, SystemPattern
 from robominer_slam.slam.robust_kernels import kernel_code
 
 EdgeKind = Literal["odometry", "loop"]
 
-
-class PoseGraphError(ValueError):
-    """A graph that cannot be built or solved; the message says which node or edge, and what was expected."""
+__all__ = ["EdgeKind", "OptimizationOptions", "OptimizationResult", "PoseGraph", "PoseGraphError"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +108,7 @@ class PoseGraph:
 
     @poses.setter
     def poses(self, poses: ArrayLike) -> None:
-        self._poses.view[...] = self._checked_poses(poses, self.node_count, "poses")
+        self._poses.view[...] = checked_poses(self.dim, poses, self.node_count, "pose")
 
     @property
     def edge_nodes(self) -> NDArray[np.int64]:
@@ -148,7 +146,7 @@ class PoseGraph:
         Raises:
             PoseGraphError: a pose has a wrong shape, is not finite or holds no rotation.
         """
-        checked = self._checked_poses(poses, None, "node")
+        checked = checked_poses(self.dim, poses, None, "node")
         first = self.node_count
         self._poses.extend(checked)
         self._system = None
@@ -194,13 +192,9 @@ class PoseGraph:
         """
         a, b = np.asarray(i, dtype=np.int64), np.asarray(j, dtype=np.int64)
         first = self.edge_count
-        for k in np.flatnonzero((np.minimum(a, b) < 0) | (np.maximum(a, b) >= self.node_count) | (a == b))[:1]:
-            raise PoseGraphError(
-                f"edge {first + k} joins nodes {a[k]} and {b[k]}; expected two different ones of the "
-                f"{self.node_count} nodes"
-            )
-        measurement = self._checked_poses(T_i_j, a.size, "measurement of edge")
-        Omega = self._checked_information(information, a.size)
+        check_ends(a, b, self.node_count, first)
+        measurement = checked_poses(self.dim, T_i_j, a.size, "measurement")
+        Omega = checked_information(self._d, information, a.size)
         try:
             code = kernel_code(kernel)
         except ValueError as error:
@@ -292,27 +286,13 @@ class PoseGraph:
         Raises:
             PoseGraphError: as `optimize`.
         """
-        d, k = self._d, len(nodes)
         enabled = self._enabled.view
-        edges, poses, system = self._edge_arrays(enabled), self._poses.view, self._pattern()
-        if system.free_nodes.size == 0:
-            return np.zeros((k * d, k * d))
-        pivot = residuals.positions(self.dim, poses).mean(axis=0)
-        costs = edge_costs(edges, self._kernels(enabled), poses, "gtsam")
-        _, blocks = normal_equations(edges, costs, poses, pivot, system, "gtsam")
-        place = np.full(self.node_count, -1)
-        place[system.free_nodes] = np.arange(system.free_nodes.size)
-        to_node = residuals.world_to_node(self.dim, poses[list(nodes)], pivot)
-        selected = np.zeros((system.free_nodes.size * d, k * d))
-        for column, node in enumerate(nodes):
-            if place[node] >= 0:
-                rows = slice(place[node] * d, (place[node] + 1) * d)
-                selected[rows, column * d : (column + 1) * d] = to_node[column].T
         try:
-            covariance = selected.T @ system.factorise(blocks).solve(selected)
+            return joint_covariance(
+                self._edge_arrays(enabled), self._kernels(enabled), self._poses.view, self._pattern(), nodes
+            )
         except SingularSystemError as error:
             raise PoseGraphError(f"the edges do not determine all poses ({error})") from error
-        return np.asarray(0.5 * (covariance + covariance.T))
 
     def marginal_covariance(self, nodes: Sequence[int]) -> FloatArray:
         """Covariance of each chosen node on its own, shape (k, d, d); see `joint_covariance`."""
@@ -346,48 +326,6 @@ class PoseGraph:
             i, j = self._i.view[enabled], self._j.view[enabled]
             fixed = np.zeros(self.node_count, dtype=np.bool_)
             fixed[list(self._fixed)] = True
-            self._check_joined(i, j, fixed)
+            check_joined(i, j, fixed)
             self._system = SystemPattern(i, j, fixed, self._d)
         return self._system
-
-    def _check_joined(self, i: NDArray[np.int64], j: NDArray[np.int64], fixed: NDArray[np.bool_]) -> None:
-        n = self.node_count
-        _, component = connected_components(coo_matrix((np.ones(i.size), (i, j)), shape=(n, n)), directed=False)
-        adrift = np.flatnonzero(~np.isin(component, component[fixed]))
-        if adrift.size:
-            raise PoseGraphError(
-                f"node {adrift[0]} is not joined to a fixed node by enabled edges ({adrift.size} of {n} nodes are "
-                "not); add edges or fix one of them"
-            )
-
-    def _checked_poses(self, poses: ArrayLike, count: int | None, what: str) -> FloatArray:
-        p = np.asarray(poses, dtype=np.float64)
-        shape = (3,) if self.dim == 2 else (4, 4)
-        if p.ndim != 1 + len(shape) or p.shape[1:] != shape or count not in (None, p.shape[0]):
-            raise PoseGraphError(f"{what}: shape {p.shape}; expected ({'k' if count is None else count}, *{shape})")
-        good = np.isfinite(p).all(axis=tuple(range(1, p.ndim)))
-        if self.dim == 3:
-            R = p[:, :3, :3]
-            off = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
-            good &= (off < 1e-6) & (np.linalg.det(R) > 0.0)
-        for k in np.flatnonzero(~good)[:1]:
-            raise PoseGraphError(f"{what} {k} of those added is not a finite pose with a proper rotation")
-        return p
-
-    def _checked_information(self, information: ArrayLike, count: int) -> FloatArray:
-        Omega = np.asarray(information, dtype=np.float64)
-        if Omega.shape != (count, self._d, self._d):
-            raise PoseGraphError(f"information: shape {Omega.shape}; expected ({count}, {self._d}, {self._d})")
-        if not np.isfinite(Omega).all():
-            raise PoseGraphError("information: a number is not finite; expected a finite symmetric matrix")
-        transposed = np.swapaxes(Omega, -1, -2)
-        scale = np.abs(Omega).max(axis=(1, 2), initial=0.0)
-        skew = np.abs(Omega - transposed).max(axis=(1, 2), initial=0.0)
-        Omega = 0.5 * (Omega + transposed)
-        least = np.linalg.eigvalsh(Omega)[:, 0]
-        for k in np.flatnonzero((skew > 1e-9 * scale) | (least < -1e-9 * scale) | (scale == 0.0))[:1]:
-            raise PoseGraphError(
-                f"information matrix {k} of those added is not symmetric and positive semidefinite (least "
-                f"eigenvalue {least[k]:.3g})"
-            )
-        return Omega

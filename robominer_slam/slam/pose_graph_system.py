@@ -20,6 +20,9 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from robominer_slam.geometry import FloatArray
 
+# Sizes of this machine: on the board's 32 bits numpy refuses 64-bit integers where it counts or gathers.
+IndexArray = NDArray[np.intp]
+
 _SYMMETRIC = {"SymmetricMode": True, "Equil": False}
 
 
@@ -51,20 +54,21 @@ class SystemPattern:
         """
         self.block_size = block_size
         free = np.flatnonzero(~fixed)
-        place = np.full(fixed.size, -1, dtype=np.int64)
+        place = np.full(fixed.size, -1, dtype=np.intp)
         place[free] = np.arange(free.size)
         order = _elimination_order(place[i], place[j], free.size)
         self.free_nodes = free[order]
         place[self.free_nodes] = np.arange(free.size)
         self._lay_out(place[i], place[j], free.size)
 
-    def _lay_out(self, a: NDArray[np.int64], b: NDArray[np.int64], f: int) -> None:
+    def _lay_out(self, a: IndexArray, b: IndexArray, f: int) -> None:
         d, m = self.block_size, a.size
         edge = np.arange(m)
         has_a, has_b = a >= 0, b >= 0
         both = has_a & has_b
-        keys, pair = np.unique(np.minimum(a[both], b[both]) * f + np.maximum(a[both], b[both]), return_inverse=True)
-        low, high = keys // f, keys % f
+        low_of_edge = np.minimum(a[both], b[both]).astype(np.int64)
+        keys, pair = np.unique(low_of_edge * f + np.maximum(a[both], b[both]), return_inverse=True)
+        low, high = (keys // f).astype(np.intp), (keys % f).astype(np.intp)
         # Blocks: the diagonal ones of the f nodes, then one per joined pair of nodes.
         self._blocks_of_edges = _signed_selection(
             (f + keys.size, m),
@@ -86,7 +90,7 @@ class SystemPattern:
         c, r = np.arange(d)[:, None], np.arange(d)
         start = first[column] * d * d + (np.arange(row.size) - first[column]) * d
         slot = start[:, None, None] + (c * per_column[column][:, None, None]) * d + r
-        self._source = np.empty(row.size * d * d, dtype=np.int64)
+        self._source = np.empty(row.size * d * d, dtype=np.intp)
         self._source[slot] = block[:, None, None] * d * d + r * d + c
         indices = np.empty(self._source.size, dtype=np.int32)
         indices[slot] = row[:, None, None] * d + r
@@ -127,19 +131,17 @@ class SystemPattern:
         return x.reshape(right_side.shape)
 
 
-def _signed_selection(
-    shape: tuple[int, int], entries: list[tuple[NDArray[np.int64], NDArray[np.int64], float]]
-) -> csr_matrix:
+def _signed_selection(shape: tuple[int, int], entries: list[tuple[IndexArray, IndexArray, float]]) -> csr_matrix:
     rows = np.concatenate([row for row, _, _ in entries])
     columns = np.concatenate([column for _, column, _ in entries])
     values = np.concatenate([np.full(row.size, sign) for row, _, sign in entries])
     return csr_matrix((values, (rows, columns)), shape=shape)
 
 
-def _elimination_order(a: NDArray[np.int64], b: NDArray[np.int64], f: int) -> NDArray[np.int64]:
+def _elimination_order(a: IndexArray, b: IndexArray, f: int) -> IndexArray:
     """Free nodes in an order of little fill: minimum degree on the graph whose edges are (a, b); -1 is fixed."""
     if f == 0:
-        return np.empty(0, dtype=np.int64)
+        return np.empty(0, dtype=np.intp)
     both = (a >= 0) & (b >= 0)
     a, b, k = a[both], b[both], np.arange(f)
     degree = 1.0 + np.bincount(a, minlength=f) + np.bincount(b, minlength=f)

@@ -1,0 +1,185 @@
+"""The simulated robot: a scenario driven through a world, as one time-ordered sequence of sensor events."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from robominer_slam import layout as layouts
+from robominer_slam.layout import WhiskerLayout
+from sim_backend import world as worlds
+from sim_backend.base_motion import BaseMotion, LevelGrid
+from sim_backend.events import EncoderEvent, Event, ImuEvent, OdometryEvent, TruthEvent, WhiskerEvent
+from sim_backend.imu import GRAVITY, Imu, ImuSettings
+from sim_backend.magnet import HallArray
+from sim_backend.odometry import BiasedOdometry, OdometrySettings, mean_body_velocity
+from sim_backend.physics import Engine, PhysicsEngine
+from sim_backend.random_streams import stream
+from sim_backend.screws import ScrewEncoders, ScrewSettings
+from sim_backend.waypoints import DriveSettings, WaypointPath
+from sim_backend.world import World
+
+FloatArray = NDArray[np.float64]
+NANOSECONDS = 1_000_000_000
+ENGINES = ("physics",)
+
+
+@dataclass(frozen=True, slots=True)
+class RobotSettings:
+    """Rates, seeds and grades of the simulated robot.
+
+    Attributes:
+        seed: of the sensors: tolerances, biases, noise, slip.
+        odometry_seed: of the ready-made odometry alone.
+        frame_interval_us: time between two whisker frames, us.
+        sensor_period_us: time between two sensors of a frame, us.
+        max_time: where to cut the drive short, s; None drives to the end.
+        drive, imu, screws, odometry: settings of the parts.
+    """
+
+    seed: int = 1
+    odometry_seed: int = 0
+    frame_interval_us: int = 40_000
+    sensor_period_us: int = 600
+    max_time: float | None = None
+    drive: DriveSettings = field(default_factory=DriveSettings)
+    imu: ImuSettings = field(default_factory=ImuSettings)
+    screws: ScrewSettings = field(default_factory=ScrewSettings)
+    odometry: OdometrySettings = field(default_factory=OdometrySettings)
+
+
+class SimulatedRobot:
+    """World, motion, whiskers and sensors joined; iterate over `events` once."""
+
+    def __init__(
+        self,
+        world: World,
+        layout: WhiskerLayout,
+        motion: BaseMotion,
+        engine: Engine,
+        settings: RobotSettings,
+    ) -> None:
+        """Switch everything on; nothing is simulated before `events` is iterated over."""
+        self.world, self.layout, self.motion, self.settings = world, layout, motion, settings
+        self.hall = HallArray(layout, settings.seed)
+        self._engine = engine
+        self._hall_noise = stream(settings.seed, "hall")
+        self._imu = Imu(settings.seed, settings.imu)
+        self._screws = ScrewEncoders(settings.seed, settings.screws)
+        self._odometry = BiasedOdometry(settings.odometry_seed, settings.odometry)
+        # The frame's last sensor has been read one period after its reading began.
+        self._frame_time_ns = 1000 * settings.sensor_period_us * layout.count
+
+    @property
+    def duration(self) -> float:
+        """Simulated time from start to end, s."""
+        limit = self.settings.max_time
+        return self.motion.duration if limit is None else min(limit, self.motion.duration)
+
+    def events(self) -> Iterator[Event]:
+        """All events, ordered by the time at which they are ready."""
+        interval = self.settings.frame_interval_us * 1000
+        waiting: list[Event] = []
+        for k in range(int(self.duration * NANOSECONDS) // interval):
+            start, end = k * interval, (k + 1) * interval
+            frame, truth = self._frame(start)
+            waiting += [truth, frame, *self._imu_events(start, end), *self._encoder_events(start, end)]
+            waiting += self._odometry_events(start, end)
+            waiting.sort(key=lambda event: event.ready_ns)
+            # What is ready later than the next frame begins waits for the next frame's events.
+            ready = sum(event.ready_ns < end for event in waiting)
+            yield from waiting[:ready]
+            waiting = waiting[ready:]
+        yield from waiting
+
+    def _frame(self, start_ns: int) -> tuple[WhiskerEvent, TruthEvent]:
+        base = self.motion.at([start_ns / NANOSECONDS])
+        reading = self._engine.read()
+        field_mT = self.hall.sample(self.hall.field(reading.hinge, base.R[0]), self._hall_noise)
+        field_mT[~self.layout.present] = 0.0
+        truth = TruthEvent(
+            start_ns,
+            start_ns,
+            base.position[0],
+            Rotation.from_matrix(base.R[0]).as_quat(),
+            base.R[0].T @ base.velocity[0],
+            base.R[0].T @ base.omega[0],
+        )
+        ready = start_ns + self._frame_time_ns
+        return WhiskerEvent(start_ns, ready, field_mT, self.layout.present, reading), truth
+
+    def _imu_events(self, start_ns: int, end_ns: int) -> list[Event]:
+        number, stamps = _samples(start_ns, end_ns, self.settings.imu.rate)
+        if not len(number):
+            return []
+        motion = self.motion.at(stamps / NANOSECONDS)
+        gyro, acceleration = self._imu.sample(motion)
+        gravity = GRAVITY * motion.R[:, 2, :]
+        return [
+            ImuEvent(int(t), int(t), w, f, g) for t, w, f, g in zip(stamps, gyro, acceleration, gravity, strict=True)
+        ]
+
+    def _encoder_events(self, start_ns: int, end_ns: int) -> list[Event]:
+        rate = self.settings.screws.rate
+        number, stamps = _samples(start_ns, end_ns, rate)
+        if not len(number):
+            return []
+        # An angle is what has turned up to its reading; at the first one, nothing has.
+        motion = self.motion.at(np.concatenate([[max(number[0] - 1, 0)], number]) / rate)
+        velocity = mean_body_velocity(motion, 1.0 / rate)
+        angles = self._screws.advance(motion.position[:-1, :2], velocity)
+        ticks = self._screws.ticks(angles)
+        radians = ticks * (2.0 * np.pi / self.settings.screws.ticks_per_turn)
+        return [EncoderEvent(int(t), int(t), c, a) for t, c, a in zip(stamps, ticks, radians, strict=True)]
+
+    def _odometry_events(self, start_ns: int, end_ns: int) -> list[Event]:
+        rate = self.settings.odometry.rate
+        number, stamps = _samples(start_ns, end_ns, rate)
+        stamps = stamps[number > 0]  # the first interval ends one period after the start
+        number = number[number > 0]
+        if not len(number):
+            return []
+        motion = self.motion.at(np.concatenate([[number[0] - 1], number]) / rate)
+        velocity = self._odometry.sample(motion)
+        return [OdometryEvent(int(t), int(t), v) for t, v in zip(stamps, velocity, strict=True)]
+
+
+def _samples(start_ns: int, end_ns: int, rate: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Numbers and times in ns of the samples of a rate in Hz that fall into [start, end)."""
+    period = NANOSECONDS / rate
+    number = np.arange(int(start_ns / period) - 1, int(end_ns / period) + 2, dtype=np.int64)
+    stamps = np.rint(number * period).astype(np.int64)
+    inside = (stamps >= start_ns) & (stamps < end_ns)
+    return number[inside], stamps[inside]
+
+
+def build_robot(
+    world_name: str = "thesis",
+    scenario: int = 1,
+    engine: str = "physics",
+    settings: RobotSettings | None = None,
+) -> SimulatedRobot:
+    """The thesis's robot in a world, about to drive a scenario.
+
+    Raises:
+        WorldError: no such world or scenario.
+        ValueError: no such engine.
+    """
+    if engine not in ENGINES:
+        raise ValueError(f"no engine is called {engine!r}, expected one of {', '.join(ENGINES)}")
+    chosen = settings or RobotSettings()
+    world = worlds.load(world_name)
+    layout = layouts.thesis_grid()
+    motion = LevelGrid(WaypointPath(world.scenario(scenario), chosen.drive))
+    physics = PhysicsEngine(
+        world,
+        layout,
+        motion,
+        read_offset=np.arange(layout.count) * chosen.sensor_period_us * 1e-6,
+        frame_interval=chosen.frame_interval_us * 1e-6,
+    )
+    return SimulatedRobot(world, layout, motion, physics, chosen)
