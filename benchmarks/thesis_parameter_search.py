@@ -87,7 +87,7 @@ def odometry_poses(truth: Trajectory, stamps_ns: NDArray[np.int64], seed: int) -
     grid = np.arange(int(truth.stamps_ns[0]), int(truth.stamps_ns[-1]) + 1, period_ns, dtype=np.int64)
     _, T = interpolate(truth, grid)
     still = np.zeros((len(grid), 3))
-    velocities = noise.sample(BaseStates(T[:, :3, 3], T[:, :3, :3], still, still))
+    velocities = noise.sample(BaseStates(T[:, :3, 3], T[:, :3, :3], still, still, still, still))
     samples = [OdometrySample(int(s), v) for s, v in zip(grid[1:], velocities, strict=True)]
     integrated = IntegratedOdometry()
     integrated.add(OdometrySample(int(grid[0]), np.zeros(3)))
