@@ -40,6 +40,10 @@ class BaseMotion(Protocol):
     def duration(self) -> float:
         """When the drive is over, s."""
 
+    @property
+    def length(self) -> float:
+        """Length of the way, m."""
+
     def at(self, time: ArrayLike) -> BaseStates:
         """The body's motion at times of shape (n,), s; 0 is the start of the drive."""
 
@@ -74,6 +78,11 @@ class LevelGrid:
     def duration(self) -> float:
         """When the path has been driven, s."""
         return self.path.duration
+
+    @property
+    def length(self) -> float:
+        """Length of the path, m."""
+        return self.path.length
 
     def at(self, time: ArrayLike) -> BaseStates:
         """The grid's motion at times of shape (n,), s."""

@@ -7,34 +7,28 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import click
-import numpy as np
 from rich.console import Console
 from rich.live import Live
 
-from robominer_slam.cli.evaluate import print_report, read_tum
-from robominer_slam.evaluation.report import DriveReport, drive_report
-from robominer_slam.mapping.height_grid import height_grid
+from sim_backend.demo_report import write_report
 from sim_backend.live_view import LiveView
 from sim_backend.process_usage import ProcessUsage, usage_of
 
 STARTUP_TIMEOUT_S = 60.0
-ENDING_TIMEOUT_S = 60.0
+ENDING_TIMEOUT_S = 30.0
 REFRESH_S = 0.5
 #: Where there is no terminal, a line this often.
 LINE_INTERVAL_S = 10.0
-#: Cells of the height map in the figure, m.
-FIGURE_CELL = 0.02
 
 
 @dataclass(frozen=True)
@@ -45,12 +39,70 @@ class DemoSettings:
     scenario: int
     seed: int
     method: str
-    max_time_s: float | None
+    max_time: float | None
     record: bool
+    as_json: bool
 
 
 class DemoError(click.ClickException):
     """A process of the demo did not do its part."""
+
+
+@dataclass
+class Child:
+    """A process of the demo and its log."""
+
+    name: str
+    process: subprocess.Popen[bytes]
+    log: Path
+
+    def wait_until(self, condition: Callable[[], bool], what: str) -> None:
+        """Wait until the condition holds, while the process lives.
+
+        Raises:
+            DemoError: the process ended, or it took too long.
+        """
+        end = time.monotonic() + STARTUP_TIMEOUT_S
+        while not condition():
+            self.check()
+            if time.monotonic() > end:
+                raise DemoError(f"{self.name}: {what} not within {STARTUP_TIMEOUT_S:g} s; see {self.log}")
+            time.sleep(0.05)
+
+    def check(self) -> None:
+        """Raise DemoError with the end of its log if the process has failed."""
+        if self.process.poll() not in (None, 0):
+            tail = self.log.read_text(encoding="utf-8", errors="replace")[-2000:]
+            raise DemoError(f"{self.name} ended with {self.process.returncode}; the end of {self.log}:\n{tail}")
+
+    def end(self) -> None:
+        """Ask it to end (SIGTERM), and wait.
+
+        Raises:
+            DemoError: it did not end, or with a failure.
+        """
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGTERM)
+        try:
+            self.process.wait(ENDING_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            raise DemoError(
+                f"{self.name} did not end within {ENDING_TIMEOUT_S:g} s of SIGTERM; see {self.log}"
+            ) from None
+        self.check()
+
+
+@contextlib.contextmanager
+def started(name: str, arguments: Sequence[str], log: Path) -> Iterator[Child]:
+    """A process whose stdout and stderr go to a file; killed on leaving if it still runs."""
+    with log.open("wb") as file:
+        process = subprocess.Popen(arguments, stdout=file, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL)
+    try:
+        yield Child(name, process, log)
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.wait()
 
 
 def free_port() -> int:
@@ -60,29 +112,75 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-@contextlib.contextmanager
-def process(arguments: Sequence[str], log: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """A process whose stdout and stderr go to a file; ended with SIGTERM, then SIGKILL, at the latest on leaving."""
-    with log.open("wb") as file:
-        child = subprocess.Popen(arguments, stdout=file, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL)
-        try:
-            yield child
-        finally:
-            if child.poll() is None:
-                child.send_signal(signal.SIGTERM)
-                try:
-                    child.wait(ENDING_TIMEOUT_S)
-                except subprocess.TimeoutExpired:
-                    child.kill()
-                    child.wait()
+def program(*arguments: str) -> list[str]:
+    """This program's command line, run by this interpreter."""
+    return [sys.executable, "-c", "from robominer_slam.cli.main import main; main()", *arguments]
 
 
-def wait_for(condition: object, child: subprocess.Popen[bytes], log: Path, what: str) -> None:
-    """Wait until `condition()` holds while the process lives."""
-    end = time.monotonic() + STARTUP_TIMEOUT_S
-    while not condition():  # type: ignore[operator]
-        if child.poll() is not None:
-            raise DemoError(f"{what}: the process ended with {child.returncode}; its log:\n{log.read_text()[-2000:]}")
-        if time.monotonic() > end:
-            raise DemoError(f"{what}: not within {STARTUP_TIMEOUT_S:g} s; see {log}")
-        time.sleep(0.05)
+def simulate_arguments(settings: DemoSettings, robot: Path, endpoint: str) -> list[str]:
+    """The simulator's command line."""
+    arguments = ["simulate", "--world", "thesis", "--scenario", str(settings.scenario), "--engine", "physics"]
+    arguments += ["--seed", str(settings.seed), "--method", settings.method]
+    arguments += ["--out", str(robot), "--listen", endpoint, "--json"]
+    if settings.max_time is not None:
+        arguments += ["--max-time", str(settings.max_time)]
+    return arguments
+
+
+def run_demo(settings: DemoSettings) -> None:
+    """Run everything, show it, write the report; ends by itself.
+
+    Raises:
+        DemoError: a process failed; the message has the end of its log.
+    """
+    begin = time.monotonic()
+    out = settings.out
+    robot = out / "robot"
+    robot.mkdir(parents=True, exist_ok=True)
+    (robot / "map.db").unlink(missing_ok=True)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    console = Console(stderr=True)
+    with contextlib.ExitStack() as stack:
+        console.print("simulated robot: physics, magnets, sensors ...", highlight=False)
+        simulate = program(*simulate_arguments(settings, robot, endpoint))
+        simulator = stack.enter_context(started("simulate", simulate, out / "simulate.log"))
+        simulator.wait_until(lambda: '"event": "ready"' in simulator.log.read_text(encoding="utf-8"), "its devices")
+        ready = next(json.loads(s) for s in simulator.log.read_text(encoding="utf-8").splitlines() if s[:1] == "{")
+        listening = [sys.executable, "-m", "sim_backend.listener", "--connect", endpoint, "--out", str(out)]
+        run = program("run", "--config", str(ready["configuration"]))
+        # The listener keeps trying until the daemon listens; the robot drives off when the daemon reads its ports.
+        listener = stack.enter_context(started("listener", listening, out / "listener.log"))
+        daemon = stack.enter_context(started("run", run, out / "run.log"))
+        listener.wait_until(lambda: "listening" in listener.log.read_text(encoding="utf-8"), "the daemon on Zenoh")
+        usage = _watch(settings, console, Path(ready["truth"]), float(ready["duration"]), simulator, daemon)
+        listener.end()
+        daemon.end()
+    write_report(out, Path(ready["truth"]), settings.scenario, usage, settings.as_json)
+    if settings.record:
+        console.print("recording the same drive ...", highlight=False)
+        recording = simulate_arguments(settings, robot, endpoint)
+        subprocess.run(program(*recording, "--record", str(out / "drive.mcap")), check=True, stdout=subprocess.DEVNULL)
+    console.print(f"{time.monotonic() - begin:.0f} s; figures and trajectories are in {out}/", highlight=False)
+
+
+def _watch(
+    settings: DemoSettings, console: Console, truth: Path, duration: float, simulator: Child, daemon: Child
+) -> ProcessUsage:
+    """Show the drive until it is over and the last pose has come; returns what the daemon has used."""
+    view = LiveView(truth, settings.out / "slam.tum", settings.out / "odometry.tum", duration)
+    next_line = time.monotonic() + LINE_INTERVAL_S
+    live = Live(console=console, get_renderable=view.render, refresh_per_second=2, transient=True)
+    frames, quiet = -1, 0
+    with contextlib.closing(view), live if console.is_terminal else contextlib.nullcontext():
+        while simulator.process.poll() is None or quiet < 2:
+            time.sleep(REFRESH_S)
+            daemon.check()
+            view.update()
+            # After the robot has stopped, the poses still on their way are waited for.
+            quiet = quiet + 1 if view.frames() == frames else 0
+            frames = view.frames()
+            if not console.is_terminal and time.monotonic() >= next_line:
+                next_line += LINE_INTERVAL_S
+                console.print(view.line(), highlight=False, soft_wrap=True)
+        simulator.check()
+    return usage_of(daemon.process.pid)

@@ -57,7 +57,7 @@ class Imu:
         walk = self._rng.normal(0.0, s.gyro_bias_drift / np.sqrt(s.rate), (n, 3)).cumsum(axis=0)
         bias = self._gyro_bias + walk
         self._gyro_bias = bias[-1]
-        force = motion.acceleration + [0.0, 0.0, GRAVITY]
+        force = motion.acceleration + np.array([0.0, 0.0, GRAVITY])
         gyro = np.einsum("nji,nj->ni", motion.R, motion.omega) + bias
         acceleration = np.einsum("nji,nj->ni", motion.R, force) + self._acceleration_bias
         gyro += self._rng.normal(0.0, s.gyro_noise, (n, 3))

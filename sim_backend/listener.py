@@ -58,7 +58,9 @@ def main(connect: str, robot: str, out: Path) -> None:
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
-    settings = ZenohSettings(connect=(connect,), mode="client", connect_timeout_s=30.0)
+    # The robot drives off soon after the daemon has begun to listen: the listener must not be a second late.
+    retry = {"connect/retry": {"period_init_ms": 50, "period_max_ms": 100, "period_increase_factor": 1}}
+    settings = ZenohSettings(connect=(connect,), mode="client", connect_timeout_s=30.0, further=retry)
     with (
         (out / "slam.tum").open("w", encoding="utf-8") as slam,
         (out / "odometry.tum").open("w", encoding="utf-8") as odometry,

@@ -6,6 +6,7 @@ Hall sensor (Infineon TLV493D). The fields are magpylib's for finite cylinders.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import magpylib
@@ -134,7 +135,9 @@ class HallArray:
 
     def _own_field(self, R: Rotation) -> FloatArray:
         """Field of each whisker's own magnet at its sensor, whisker axes, shape (n, 3), mT."""
-        field: FloatArray = magpylib.func.cylinder_field(
+        # magpylib comes without types.
+        cylinder_field: Callable[..., FloatArray] = magpylib.func.cylinder_field
+        field = cylinder_field(
             field="B",
             observers=self._p_sensor,
             dimensions=self._dimensions,
@@ -147,7 +150,8 @@ class HallArray:
     def _neighbour_field(self, R: Rotation) -> FloatArray:
         """Field of all other magnets, whisker axes, shape (n, 3), mT: dipoles, as 39 mm is ten magnets away."""
         axis = (R * self._R_rod_magnet).apply([0.0, 0.0, 1.0])
-        return (self._neighbours @ (self._moment[:, None] * axis).ravel()).reshape(-1, 3)
+        field: FloatArray = self._neighbours @ (self._moment[:, None] * axis).ravel()
+        return field.reshape(-1, 3)
 
     def _neighbour_matrix(self) -> FloatArray:
         """Moments of all magnets, in their whiskers' axes, A m2, to fields at the sensors, shape (3 n, 3 n), mT.
@@ -169,10 +173,12 @@ class HallArray:
 
     def _earth(self, R_map_base: FloatArray) -> FloatArray:
         """Earth's field, whisker axes, shape (n, 3), mT."""
-        return np.einsum("nji,j->ni", self.layout.R_base_whisker, R_map_base.T @ EARTH_MT)
+        field: FloatArray = np.einsum("nji,j->ni", self.layout.R_base_whisker, R_map_base.T @ EARTH_MT)
+        return field
 
     def _in_sensor_axes(self, field: FloatArray) -> FloatArray:
-        return self._gain * self._R_whisker_sensor.inv().apply(field)
+        turned: FloatArray = self._gain * self._R_whisker_sensor.inv().apply(field)
+        return turned
 
 
 def _rod_rotation(hinge: FloatArray) -> Rotation:

@@ -46,7 +46,8 @@ class BiasedOdometry:
     def sample(self, motion: BaseStates) -> FloatArray:
         """Body velocities vx, vy, wz over the n intervals between n + 1 instants, shape (n, 3), m/s, m/s, rad/s."""
         velocity = mean_body_velocity(motion, 1.0 / self.settings.rate)
-        return velocity + self.bias + self._rng.normal(0.0, 1.0, velocity.shape) * self._deviation
+        noise: FloatArray = self.bias + self._rng.normal(0.0, 1.0, velocity.shape) * self._deviation
+        return velocity + noise
 
 
 def mean_body_velocity(motion: BaseStates, interval: float) -> FloatArray:

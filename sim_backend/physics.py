@@ -153,7 +153,8 @@ class PhysicsEngine:
         p = self.layout.p_base + self.layout.length[:, None] * np.einsum(
             "nij,nj->ni", self.layout.R_base_whisker, rod_direction(self._qpos[:, 7:])
         )
-        return base.position[0] + p @ base.R[0].T
+        tips: FloatArray = base.position[0] + p @ base.R[0].T
+        return tips
 
     def _run(self, first: int, count: int) -> tuple[FloatArray, BoolArray]:
         """Do `count` steps from step number `first`.

@@ -185,7 +185,7 @@ def build_robot(
         world,
         layout,
         motion,
-        read_offset=np.arange(layout.count) * chosen.sensor_period_us * 1e-6,
+        read_offset=np.arange(layout.count, dtype=np.float64) * chosen.sensor_period_us * 1e-6,
         frame_interval=chosen.frame_interval_us * 1e-6,
     )
     return SimulatedRobot(world, layout, motion, physics, chosen)

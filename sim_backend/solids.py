@@ -39,7 +39,8 @@ class Solid:
         origin = offset @ self.R
         direction = self.R[2]
         intersect = {"box": self._box, "cylinder": self._cylinder, "sphere": self._sphere}[self.shape]
-        return intersect(origin, direction) + self.centre[2]
+        height: FloatArray = intersect(origin, direction) + self.centre[2]
+        return height
 
     def half_height(self) -> float:
         """Height of the highest point above the centre, m."""

@@ -9,6 +9,7 @@ import json
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -108,7 +109,7 @@ def passed_ground(ground: HeightField, paths: list[FloatArray], reach: float) ->
     x = ground.origin[0] + ground.cell * np.arange(nx)[None, :]
     y = ground.origin[1] + ground.cell * np.arange(ny)[:, None]
     passed = np.zeros(ground.z.shape, dtype=np.bool_)
-    legs = {tuple(np.concatenate([a[:2], b[:2]])) for path in paths for a, b in zip(path, path[1:], strict=False)}
+    legs = {tuple(np.concatenate([a[:2], b[:2]])) for path in paths for a, b in pairwise(path)}
     for ax, ay, bx, by in legs:
         dx, dy = bx - ax, by - ay
         square = dx * dx + dy * dy

@@ -26,7 +26,7 @@ def print_report(report: DriveReport, title: str) -> None:
     errors, figures = report_rows(report)
     table = Table(title=title)
     for column in ERROR_COLUMNS:
-        table.add_column(column, justify="left" if column == "method" else "right")
+        table.add_column(column, justify="left" if column in ("error", "method") else "right")
     for row in errors:
         table.add_row(*row)
     console = Console()

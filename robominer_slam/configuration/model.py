@@ -91,12 +91,27 @@ class EstimationSection(Section):
         "fused", "", "fused: IMU and screws; odometry: the ready-made odometry alone"
     )
     sigma_screws_vx: float = parameter(
-        0.05, "m/s", "white part of the screws' error, slip is slower; RM3's crew found 0.16 with slip in it",
+        0.02, "m/s", "white part of the screws' error; RM3's crew found 0.16 in a regression that has slip in it",
         low=1e-4, high=10.0,
     )  # fmt: skip
-    sigma_screws_vy: float = parameter(0.05, "m/s", "as for vx", low=1e-4, high=10.0)
+    sigma_screws_vy: float = parameter(0.02, "m/s", "as for vx", low=1e-4, high=10.0)
     sigma_screws_wz: float = parameter(
-        0.2, "rad/s", "RM3's crew found 0.22; the gyro is far better and decides the heading", low=1e-4, high=10.0
+        0.015, "rad/s", "encoder noise through the kinematics; makes the gyro's bias visible on straight drives",
+        low=1e-4, high=10.0,
+    )  # fmt: skip
+    screw_slip: float = parameter(
+        0.2,
+        "1",
+        "share of each velocity that slip may eat: 2 to 30 % on the grounds that RM3 has seen",
+        low=0.0,
+        high=1.0,
+    )
+    screw_slip_turn: float = parameter(
+        1.0,
+        "1",
+        "as screw_slip, for the turn rate: slip lasts seconds and would pass for gyro bias",
+        low=0.0,
+        high=10.0,
     )
     sigma_gyro: float = parameter(0.005, "rad/s", "BNO080 per sample at 100 Hz with margin", low=1e-5, high=1.0)
     sigma_gyro_bias_start: float = parameter(0.002, "rad/s", "0.1 deg/s: a BNO080's bias at start", low=0.0, high=0.1)
@@ -134,12 +149,19 @@ class ThesisSection(Section):
     search_radius: float = parameter(0.75, "m", "thesis 3.4.4: candidates within it", low=0.05, high=20.0)
     max_fitness: float = parameter(0.016, "m2", "thesis 3.4.4: mean squared distance", low=1e-6, high=1.0)
     scan_voxel: float = parameter(0.02, "m", "voxel filter per scan: by search", low=0.0, high=0.5)
-    correspondence_distance: float = parameter(0.5, "m", "by search", low=0.01, high=10.0)
+    correspondence_distance: float = parameter(0.1, "m", "by search", low=0.01, high=10.0)
     min_travel: float = parameter(
-        1.0, "m", "driven since the candidate before a closure: by search", low=0.0, high=100.0
+        4.0, "m", "driven since the candidate before a closure: by search", low=0.0, high=100.0
     )
     closure_spacing: float = parameter(0.3, "m", "driven between two closures: by search", low=0.0, high=100.0)
     kernel: Literal["none", "huber", "cauchy"] = parameter("huber", "", "kernel of the closures: by search")
+    odometry_sigma: float = parameter(
+        0.01,
+        "m, rad",
+        "of an odometry edge; 0: from the scans' fitness, as hdl_graph_slam: by search",
+        low=0.0,
+        high=1.0,
+    )
 
 
 class SlamSection(Section):

@@ -92,6 +92,7 @@ class FusedOdometry:
         self._screws: ScrewAngles | None = None
         self._R_gyro = np.array([[noise.sigma_gyro**2]])
         self._R_screws = np.diag(np.square([noise.sigma_screws_vx, noise.sigma_screws_vy, noise.sigma_screws_wz]))
+        self._slip = np.array([noise.screw_slip, noise.screw_slip, noise.screw_slip_turn])
         self._R_still = np.eye(3) * STILL_SIGMA**2
         self.stale = 0
 
@@ -144,7 +145,9 @@ class FusedOdometry:
             self._filter.update(np.zeros(3), lambda _: H_VELOCITY, velocity_measurement, self._R_still)
         else:
             velocity = (self._screw_matrix @ speed)[:3]
-            self._filter.update(velocity, lambda _: H_VELOCITY, velocity_measurement, self._R_screws)
+            # Slip takes a share of what the screws do: fast motion is known less well than slow motion.
+            R = self._R_screws + np.diag(np.square(self._slip * velocity))
+            self._filter.update(velocity, lambda _: H_VELOCITY, velocity_measurement, R)
 
     def _predict(self, stamp_ns: int) -> None:
         previous = self._stamp_ns

@@ -8,9 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from numpy.typing import NDArray
+
 from robominer_slam.evaluation.metrics import ErrorStatistics, TrajectoryErrors, trajectory_errors
 from robominer_slam.evaluation.pose_graph_errors import ClosureErrors, closure_errors
 from robominer_slam.evaluation.trajectory import Trajectory
+
+FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -79,19 +83,13 @@ def drive_report(
 
 
 def report_rows(report: DriveReport) -> tuple[list[list[str]], list[tuple[str, str]]]:
-    """The report as rows of text: errors (method, frames, mean, median, 95 %, max, ...), and named figures."""
+    """The report as rows of text: errors (see ERROR_COLUMNS), and named figures."""
     errors = []
-    for name, one in (("odometry", report.odometry), ("SLAM", report.slam)):
-        position = ErrorStatistics.of(one.position)
-        heading = ErrorStatistics.of(np.rad2deg(one.heading))
-        errors.append(
-            [
-                name,
-                str(len(one.stamps_ns)),
-                *(f"{value:.3f}" for value in (position.mean, position.median, position.p95, position.max)),
-                *(f"{value:.2f}" for value in (heading.mean, heading.median, heading.p95, heading.max)),
-            ]
-        )
+    for what, pick in (("position (m)", _position), ("heading (deg)", _heading)):
+        for name, one in (("odometry", report.odometry), ("SLAM", report.slam)):
+            statistics = ErrorStatistics.of(pick(one))
+            values = (statistics.mean, statistics.median, statistics.p95, statistics.max)
+            errors.append([what, name, *(f"{value:.3f}" for value in values), str(len(one.stamps_ns))])
     wrong = int(report.closures.wrong.sum())
     figures = [
         ("keyframes", str(report.keyframes)),
@@ -106,15 +104,12 @@ def report_rows(report: DriveReport) -> tuple[list[list[str]], list[tuple[str, s
     return errors, figures
 
 
-ERROR_COLUMNS = (
-    "method",
-    "frames",
-    "mean (m)",
-    "median (m)",
-    "95 % (m)",
-    "max (m)",
-    "mean (deg)",
-    "median (deg)",
-    "95 % (deg)",
-    "max (deg)",
-)
+ERROR_COLUMNS = ("error", "method", "mean", "median", "95 %", "max", "frames")
+
+
+def _position(errors: TrajectoryErrors) -> FloatArray:
+    return errors.position
+
+
+def _heading(errors: TrajectoryErrors) -> FloatArray:
+    return np.asarray(np.rad2deg(errors.heading))

@@ -13,7 +13,8 @@ FloatArray = NDArray[np.float64]
 Matcher = Literal["ICP", "PLANE_ICP", "GICP", "VGICP"]
 
 NEIGHBOURS = 10
-MAX_ITERATIONS = 64
+#: small_gicp's default; matches that need more are false nearly always.
+MAX_ITERATIONS = 20
 
 
 class ScanTarget:

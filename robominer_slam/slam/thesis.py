@@ -87,7 +87,9 @@ class ThesisBackend:
         self._edges.append(GraphEdge(kind, i, j, T_i_new, information, 1.0))
 
     def _odometry_information(self, T_last_new: FloatArray) -> FloatArray:
-        """As hdl_graph_slam: from the fitness of neighbouring scans laid upon each other by odometry."""
+        """Constant, or as hdl_graph_slam: from the fitness of neighbouring scans laid upon each other by odometry."""
+        if self._parameters.odometry_sigma > 0.0:
+            return np.eye(6) / self._parameters.odometry_sigma**2
         last, new = self._targets[-2], self._targets[-1]
         if last is None or new is None:
             return information_from_fitness(0.0)

@@ -1,0 +1,142 @@
+"""`robominer-slam simulate`: command line of the simulated robot; the work is in `simulate.py`."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import click
+
+EPILOG = """
+\b
+Example: drive scenario 1, and run the daemon on it in another terminal:
+  robominer-slam simulate --scenario 1 --out out/sim
+  robominer-slam run --config out/sim/config.toml
+\b
+A recording instead, as fast as it goes:
+  robominer-slam simulate --scenario 3 --out out/sim --record out/scenario3.mcap
+"""
+
+
+@click.command(epilog=EPILOG)
+@click.option("--world", default="thesis", show_default=True, help="World to drive in: thesis.")
+@click.option("--scenario", default=1, show_default=True, help="Scenario of the world, 1 to 5.")
+@click.option(
+    "--engine", type=click.Choice(["physics"]), default="physics", show_default=True, help="What moves the whiskers."
+)
+@click.option("--seed", default=1, show_default=True, help="Tolerances, biases, noise and slip of all sensors.")
+@click.option("--odometry-seed", default=0, show_default=True, help="Bias and noise of the ready-made odometry.")
+@click.option(
+    "--out",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=Path("out/sim"),
+    show_default=True,
+    help="Folder for ports, configuration, calibration and ground truth.",
+)
+@click.option(
+    "--rate",
+    type=click.FloatRange(0.05, 20.0),
+    default=1.0,
+    show_default=True,
+    help="Simulated seconds per second; the devices then show a robot that drives so many times as fast.",
+)
+@click.option(
+    "--source",
+    type=click.Choice(["fused", "odometry"]),
+    default="fused",
+    show_default=True,
+    help="Odometry in the configuration: IMU and screws, or the ready-made one.",
+)
+@click.option("--method", default=None, help="SLAM method in the configuration (default: the daemon's).")
+@click.option("--listen", default="tcp/127.0.0.1:7447", show_default=True, help="Zenoh endpoint in the configuration.")
+@click.option("--max-time", type=click.FloatRange(min=0.1), default=None, help="Cut the drive short, s.")
+@click.option(
+    "--wait",
+    type=click.FloatRange(0.0),
+    default=60.0,
+    show_default=True,
+    help="Drive off without a reader after so many seconds.",
+)
+@click.option(
+    "--record",
+    "recording",
+    type=click.Path(dir_okay=False, path_type=Path),
+    default=None,
+    help="Write an MCAP recording instead of serving ports.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object per line.")
+def simulate(
+    world: str,
+    scenario: int,
+    engine: str,
+    seed: int,
+    odometry_seed: int,
+    out: Path,
+    rate: float,
+    source: str,
+    method: str | None,
+    listen: str,
+    max_time: float | None,
+    wait: float,
+    recording: Path | None,
+    as_json: bool,
+) -> None:
+    """The simulated robot: drives a scenario and serves its devices on pseudo-terminals.
+
+    It stands still until the ports are read (or --wait is over), then for two more seconds, drives, and ends.
+    """
+    # MuJoCo and magpylib take a second to import: not for --help.
+    from sim_backend import simulate as simulation
+    from sim_backend.robot import RobotSettings
+    from sim_backend.world import WorldError
+
+    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    settings = simulation.SimulationSettings(
+        out=out,
+        world=world,
+        scenario=scenario,
+        engine=engine,
+        robot=RobotSettings(seed=seed, odometry_seed=odometry_seed, max_time=max_time),
+        rate=rate,
+        wait=wait,
+        source=source,
+        method=method,
+        listen=listen,
+    )
+
+    def ready(report: simulation.ReadyReport) -> None:
+        if as_json:
+            _print_json({"event": "ready", **asdict(report)})
+            return
+        for name, port in report.ports.items():
+            click.echo(f"{name:10s} {port}")
+        click.echo(f"configuration: {report.configuration}")
+        click.echo(f"ground truth:  {report.truth}")
+        click.echo(f"scenario {scenario}: {report.length:.1f} m in {report.duration / rate:.0f} s")
+
+    try:
+        if recording is not None:
+            counts = simulation.record_drive(settings, recording)
+            if as_json:
+                _print_json({"event": "recorded", "file": recording, "messages": counts})
+            else:
+                click.echo(f"{recording}: " + ", ".join(f"{n} on {topic}" for topic, n in counts.items()))
+            return
+        report = simulation.serve(settings, ready)
+    except (WorldError, OSError) as error:
+        failure = click.ClickException(str(error))
+        failure.exit_code = 2
+        raise failure from error
+    if as_json:
+        _print_json({"event": "done", **asdict(report)})
+    else:
+        packets = ", ".join(f"{name} {n} ({report.dropped[name]} dropped)" for name, n in report.sent.items())
+        click.echo(f"{'stopped' if report.stopped else 'driven'} after {report.seconds:.1f} s; packets: {packets}")
+
+
+def _print_json(values: dict[str, object]) -> None:
+    click.echo(json.dumps(values, default=str))
+    sys.stdout.flush()

@@ -1,0 +1,94 @@
+"""Writes what the daemon needs to run on the simulated robot: configuration, calibration and jig table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import tomlkit
+
+from calibration.file_format import to_text
+from calibration.fit import JigSamples, fit_jig
+from robominer_slam.layout import WhiskerLayout
+from sim_backend.jig import jig_sweep, to_csv
+
+CONFIGURATION, CALIBRATION, JIG_TABLE = "config.toml", "calibration.json", "jig.csv"
+BAUD = 115200
+#: A calibration of a simulated array was made on the day its recordings begin.
+CALIBRATION_DATE = "2021-06-01"
+
+
+def configuration_text(
+    ports: Mapping[str, Path],
+    layout: WhiskerLayout,
+    *,
+    ticks_per_turn: int,
+    source: str,
+    method: str | None,
+    store: Path,
+    listen: str,
+    robot_id: str = "rm3",
+) -> str:
+    """A configuration for the daemon (interfaces, section 5).
+
+    Args:
+        ports: device name (whiskers, imu, screws, odometry) to port; one that the source does not use is left out.
+        layout: of the array.
+        ticks_per_turn: of the screws' encoders.
+        source: `fused` or `odometry`.
+        method: of SLAM; None leaves the daemon's default.
+        store: where the daemon keeps its map.
+        listen: Zenoh endpoint of the daemon.
+        robot_id: part of every Zenoh key.
+    """
+    document = tomlkit.document()
+    document.add(tomlkit.comment("Written by `robominer-slam simulate` for the simulated robot."))
+    document["robot"] = {"id": robot_id, "layout": layout.name, "role": "all"}
+    devices = tomlkit.aot()
+    for name, port in ports.items():
+        if name not in USED_BY_SOURCE[source]:
+            continue
+        device = tomlkit.table()
+        device.update({"name": name, "port": str(port), "protocol": "framed", "baud": BAUD})
+        if name == "whiskers":
+            device["calibration"] = CALIBRATION
+        if name == "screws":
+            device["ticks_per_turn"] = ticks_per_turn
+        devices.append(device)
+    document["device"] = devices
+    document["estimation"] = {"source": source}
+    if method is not None:
+        document["slam"] = {"method": method}
+    document["store"] = {"path": str(store)}
+    document["zenoh"] = {"listen": [listen], "connect": []}
+    return tomlkit.dumps(document)
+
+
+#: Devices that each source of odometry needs.
+USED_BY_SOURCE = {"fused": ("whiskers", "imu", "screws"), "odometry": ("whiskers", "odometry")}
+
+
+def write_calibration(folder: Path, layout: WhiskerLayout, seed: int) -> str:
+    """Sweep the array that `seed` stands for in the jig and fit it, as a roboticist would.
+
+    Writes the jig table and the calibration into `folder`.
+
+    Returns:
+        The calibration file's text.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    rows = jig_sweep(layout, seed)
+    (folder / JIG_TABLE).write_text(to_csv(rows), encoding="utf-8")
+    report = fit_jig(JigSamples.from_rows(rows.tolist()), layout.rows, layout.cols)
+    text = to_text(
+        report,
+        array_id=f"sim-{seed}",
+        layout=layout.name,
+        rows=layout.rows,
+        cols=layout.cols,
+        date=CALIBRATION_DATE,
+    )
+    (folder / CALIBRATION).write_text(text + "\n", encoding="utf-8")
+    return text

@@ -1,0 +1,28 @@
+"""`robominer-slam demo`: command line; the work is in `demo.py`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+@click.command(epilog="Example: robominer-slam demo --out out --scenario 1")
+@click.option("--out", type=click.Path(file_okay=False, path_type=Path), default=Path("out"), show_default=True,
+              help="Folder for figures, trajectories, report and logs.")  # fmt: skip
+@click.option("--scenario", type=click.IntRange(1, 5), default=1, show_default=True, help="Of the thesis.")
+@click.option("--seed", default=1, show_default=True, help="Tolerances, biases, noise and slip of all sensors.")
+@click.option("--method", type=click.Choice(["thesis", "none"]), default="thesis", show_default=True,
+              help="SLAM method; none gives exactly the odometry.")  # fmt: skip
+@click.option("--max-time", type=click.FloatRange(min=5.0), help="Cut the drive short, s.")
+@click.option("--record", is_flag=True, help="Also write the drive as OUT/drive.mcap, for replay.")
+@click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
+def demo(out: Path, scenario: int, seed: int, method: str, max_time: float | None, record: bool, as_json: bool) -> None:
+    """A simulated robot, the daemon and a listener, each a process; then the report with figures.
+
+    Takes as long as the scenario: two and a half minutes for scenario 1.
+    """
+    from sim_backend.demo import DemoSettings, run_demo  # matplotlib and rich: not for --help
+
+    out.mkdir(parents=True, exist_ok=True)
+    run_demo(DemoSettings(out, scenario, seed, method, max_time, record, as_json))

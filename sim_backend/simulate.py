@@ -1,0 +1,193 @@
+"""One simulated drive, on serial devices or into a recording, with the files that belong to it."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+
+from robominer_slam import layout as layouts
+from sim_backend.configuration_writer import CONFIGURATION, USED_BY_SOURCE, configuration_text, write_calibration
+from sim_backend.device_server import DeviceServer, StartTime
+from sim_backend.events import TruthEvent
+from sim_backend.recorder import record
+from sim_backend.robot import RobotSettings, SimulatedRobot, build_robot
+from sim_backend.serial_devices import EVENT_OF_DEVICE, ClockSettings, plug_in
+from sim_backend.truth import TruthFile
+
+TRUTH = "ground_truth.txt"
+PORTS = "dev"
+STORE = "map.db"
+
+
+@dataclass(frozen=True, slots=True)
+class SimulationSettings:
+    """What to simulate and where to put it.
+
+    Attributes:
+        out: folder for ports, configuration, calibration and truth; created if absent.
+        world, scenario, engine: what is driven, and by what.
+        robot: rates and seeds.
+        rate: simulated seconds per second.
+        wait: how long to wait for a host before driving off without one, s.
+        source: of odometry in the written configuration: `fused` or `odometry`.
+        method: of SLAM in the written configuration; None for the daemon's default.
+        listen: Zenoh endpoint in the written configuration.
+        clocks: clocks of devices that differ from the default.
+    """
+
+    out: Path
+    world: str = "thesis"
+    scenario: int = 1
+    engine: str = "physics"
+    robot: RobotSettings = field(default_factory=RobotSettings)
+    rate: float = 1.0
+    wait: float = 60.0
+    source: str = "fused"
+    method: str | None = None
+    listen: str = "tcp/127.0.0.1:7447"
+    clocks: dict[str, ClockSettings] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ReadyReport:
+    """What a host needs to know when the devices are plugged in."""
+
+    ports: dict[str, Path]
+    configuration: Path
+    truth: Path
+    duration: float
+    length: float
+
+
+@dataclass(frozen=True, slots=True)
+class DriveReport:
+    """What happened: packets taken and dropped by device, whether a host came, whether the drive was cut short."""
+
+    sent: dict[str, int]
+    dropped: dict[str, int]
+    host_came: bool
+    stopped: bool
+    worst_lateness: float
+    seconds: float
+
+
+def serve(settings: SimulationSettings, on_ready: Callable[[ReadyReport], None]) -> DriveReport:
+    """Serve one drive on pseudo-terminals; ends when it has been driven, or on SIGTERM or SIGINT.
+
+    Raises:
+        WorldError: no such world or scenario.
+        OSError: a file or port cannot be made.
+    """
+    out = settings.out.absolute()
+    out.mkdir(parents=True, exist_ok=True)
+    robot = _build(settings)
+    write_calibration(out, robot.layout, settings.robot.seed)
+    devices = plug_in(out / PORTS, tuple(EVENT_OF_DEVICE), time.monotonic_ns(), settings.clocks)
+    ports = {name: device.path for name, device in devices.items()}
+    (out / CONFIGURATION).write_text(_configuration(settings, robot, out), encoding="utf-8")
+    with TruthFile(out / TRUTH) as truth:
+
+        def write_truth(event: TruthEvent, start: StartTime) -> None:
+            truth.write(event, start.unix(event.time_ns))
+
+        array = (robot.layout.rows, robot.layout.cols, settings.robot.sensor_period_us)
+        server = DeviceServer(devices, array, rate=settings.rate, on_truth=write_truth)
+        try:
+            with _stop_on_signals(server.stop) as stopped:
+                on_ready(ReadyReport(ports, out / CONFIGURATION, out / TRUTH, robot.duration, robot.motion.length))
+                # A daemon opens the ports of its configuration only: it need not ping the others.
+                host_came = server.wait_for_host(settings.wait, USED_BY_SOURCE[settings.source])
+                begin = time.monotonic()
+                if not stopped.is_set():
+                    server.serve(robot.events())
+        finally:
+            server.close()
+    return DriveReport(
+        {name: device.sent for name, device in devices.items()},
+        {name: device.port.dropped for name, device in devices.items()},
+        host_came,
+        stopped.is_set(),
+        server.worst_lateness_ns * 1e-9,
+        time.monotonic() - begin,
+    )
+
+
+def record_drive(
+    settings: SimulationSettings, path: Path, on_progress: Callable[[float], None] | None = None
+) -> dict[str, int]:
+    """Record one drive without devices, as fast as it goes; returns the messages written, by topic.
+
+    Calls `on_progress` with the share of the drive that is done.
+
+    Raises:
+        WorldError: no such world or scenario.
+        RecordingError: the recording cannot be written.
+        OSError: a file cannot be made.
+    """
+    out = settings.out.absolute()
+    out.mkdir(parents=True, exist_ok=True)
+    robot = _build(settings)
+    calibration = write_calibration(out, robot.layout, settings.robot.seed)
+    (out / CONFIGURATION).write_text(_configuration(settings, robot, out), encoding="utf-8")
+    duration_ns = 1e9 * robot.duration
+    return record(
+        robot.events(),
+        path,
+        array=(robot.layout.rows, robot.layout.cols, settings.robot.sensor_period_us),
+        attachments={
+            "layout.json": layouts.to_json(robot.layout).encode(),
+            "calibration.json": calibration.encode(),
+            # Without the folder, so that the same seed gives the same recording anywhere.
+            "config.toml": _configuration(settings, robot, Path()).encode(),
+        },
+        metadata={
+            "world": settings.world,
+            "scenario": str(settings.scenario),
+            "engine": settings.engine,
+            "seed": str(settings.robot.seed),
+            "odometry_seed": str(settings.robot.odometry_seed),
+        },
+        on_progress=None if on_progress is None else lambda time_ns: on_progress(time_ns / duration_ns),
+    )
+
+
+def _build(settings: SimulationSettings) -> SimulatedRobot:
+    return build_robot(settings.world, settings.scenario, settings.engine, settings.robot)
+
+
+def _configuration(settings: SimulationSettings, robot: SimulatedRobot, folder: Path) -> str:
+    return configuration_text(
+        {name: folder / PORTS / name for name in EVENT_OF_DEVICE},
+        robot.layout,
+        ticks_per_turn=settings.robot.screws.ticks_per_turn,
+        source=settings.source,
+        method=settings.method,
+        store=folder / STORE,
+        listen=settings.listen,
+    )
+
+
+@contextmanager
+def _stop_on_signals(stop: Callable[[], None]) -> Iterator[threading.Event]:
+    """Let SIGTERM and SIGINT end the drive cleanly; yields whether one came. Only the main thread has signals."""
+    came = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield came
+        return
+
+    def handle(_number: int, _frame: FrameType | None) -> None:
+        came.set()
+        stop()
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield came
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
