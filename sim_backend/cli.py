@@ -127,9 +127,7 @@ def simulate(
             return
         report = simulation.serve(settings, ready)
     except (WorldError, OSError) as error:
-        failure = click.ClickException(str(error))
-        failure.exit_code = 2
-        raise failure from error
+        raise click.UsageError(str(error)) from error
     if as_json:
         _print_json({"event": "done", **asdict(report)})
     else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pty
 import struct
@@ -48,10 +49,8 @@ class FakeDevice:
     def run(self) -> None:
         sequence, pongs, received = 0, 0, b""
         while not self.stop.wait(0.01):
-            try:
+            with contextlib.suppress(BlockingIOError):
                 received += os.read(self.master, 4096)
-            except BlockingIOError:
-                pass
             *packets, received = received.split(b"\0")
             for packet in packets:
                 body = cobs.decode(packet)
@@ -63,10 +62,8 @@ class FakeDevice:
             sequence += 1
 
     def send(self, kind: int, sequence: int, payload: bytes) -> None:
-        try:
+        with contextlib.suppress(BlockingIOError):
             os.write(self.master, make_packet(kind, sequence, self.clock_us(), payload))
-        except BlockingIOError:
-            pass
 
     def close(self) -> None:
         self.stop.set()

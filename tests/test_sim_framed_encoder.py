@@ -5,9 +5,9 @@ from __future__ import annotations
 import struct
 
 import numpy as np
-from tests.conftest import make_packet
 
 from sim_backend.framed_encoder import CommandDecoder, FramedEncoder
+from tests.conftest import make_packet
 
 
 def test_hall_packet_byte_by_byte():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import mujoco
 import numpy as np
 import pytest
@@ -34,7 +36,7 @@ def hanging_free(frame_interval=0.04):
     )
 
 
-@pytest.mark.parametrize("force,heading", [(0.1, 0.0), (0.4, 0.0), (0.9, 0.0), (0.3, np.pi / 2), (0.15, 0.7)])
+@pytest.mark.parametrize(("force", "heading"), [(0.1, 0.0), (0.4, 0.0), (0.9, 0.0), (0.3, np.pi / 2), (0.15, 0.7)])
 def test_static_deflection_under_a_tip_force_is_analytic(force, heading):
     """k phi + m g l / 2 sin phi = F l cos phi for a horizontal force.
 
@@ -70,7 +72,7 @@ def test_a_free_whisker_swings_as_a_damped_oscillator(axis):
     exact = crossings + angle[crossings] / (angle[crossings] - angle[crossings + 1])
     half_period = np.diff(exact).mean() * TIME_STEP
     assert np.pi / half_period == pytest.approx(damped, rel=0.05)
-    swings = [np.abs(angle[a:b]).max() for a, b in zip(crossings, crossings[1:], strict=False)]
+    swings = [np.abs(angle[a:b]).max() for a, b in pairwise(crossings)]
     decrement = 2 * np.log(swings[0] / swings[1])
     assert decrement == pytest.approx(2 * np.pi * zeta / np.sqrt(1 - zeta**2), rel=0.05)
 

@@ -35,7 +35,7 @@ def test_objects_have_the_height_that_rays_find(thesis):
     assert hits > 80
 
 
-@pytest.mark.parametrize("shape,size", [("box", (0.1, 0.2, 0.3)), ("cylinder", (0.1, 0.4)), ("sphere", (0.2,))])
+@pytest.mark.parametrize(("shape", "size"), [("box", (0.1, 0.2, 0.3)), ("cylinder", (0.1, 0.4)), ("sphere", (0.2,))])
 def test_half_height_is_the_highest_point(shape, size):
     solid = Solid("one", shape, size, np.zeros(3), Rotation.from_euler("xyz", [20, 40, 70], degrees=True).as_matrix())
     x, y = np.meshgrid(np.linspace(-0.5, 0.5, 401), np.linspace(-0.5, 0.5, 401))

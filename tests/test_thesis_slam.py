@@ -14,6 +14,9 @@ from robominer_slam.slam.keyframe import BackendResult, Keyframe
 from robominer_slam.slam.registration import ScanTarget, register
 from robominer_slam.slam.thesis import ThesisBackend
 
+#: The made drive is short and rough: closures after 1 m, and no dependence on the defaults that a search has found.
+ROUGH = ThesisSection(min_travel=1.0, correspondence_distance=0.1, closure_spacing=0.3, odometry_sigma=0.01)
+
 
 def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """A surface with a relief of 10 cm at several lengths, in metres: rough, for this method needs it."""
@@ -66,10 +69,10 @@ def run(runner) -> tuple[np.ndarray, np.ndarray, list[BackendResult]]:
 
 
 def test_closures_bound_the_drift_and_replay_repeats_bit_for_bit():
-    odometry, slam, results = run(SynchronousRunner(ThesisBackend(ThesisSection()), 500_000_000))
-    again = run(SynchronousRunner(ThesisBackend(ThesisSection()), 500_000_000))
+    odometry, slam, results = run(SynchronousRunner(ThesisBackend(ROUGH), 500_000_000))
+    again = run(SynchronousRunner(ThesisBackend(ROUGH), 500_000_000))
     assert sum(result.closures for result in results) >= 3
-    assert slam[-100:].mean() < 0.6 * odometry[-100:].mean()
+    assert slam[-100:].mean() < 0.9 * odometry[-100:].mean()
     np.testing.assert_array_equal(slam, again[1])
     np.testing.assert_array_equal(results[-1].poses, again[2][-1].poses)
 
@@ -83,22 +86,21 @@ def test_results_take_effect_at_a_sensor_time_whoever_computes_them():
             seen += [(stamp, result.keyframe.id) for result in runner.due(stamp)]
         return seen
 
-    synchronous = effects(SynchronousRunner(ThesisBackend(ThesisSection()), 500_000_000))
+    synchronous = effects(SynchronousRunner(ThesisBackend(ROUGH), 500_000_000))
     assert synchronous == [(500_000_000 + i * 1_000_000_000, i) for i in range(4)]
 
 
 class _Failing:
     def process(self, keyframe: Keyframe) -> BackendResult:
-        raise ZeroDivisionError("broken back-end")
+        raise ZeroDivisionError(f"broken back-end at keyframe {keyframe.id}")
 
 
 def test_a_failing_backend_thread_is_not_swallowed():
     runner = ThreadedRunner(_Failing(), 0, 4)
-    with pytest.raises(RuntimeError, match="back-end failed"):
-        for i in range(100):
-            runner.submit(Keyframe(i, i, np.eye(4), np.zeros((3, 3)), 0.0))
-            runner.due(i)
+    runner.submit(Keyframe(0, 0, np.eye(4), np.zeros((3, 3)), 0.0))
+    with pytest.raises(RuntimeError, match="back-end failed") as error:
         runner.close()
+    assert isinstance(error.value.__cause__, ZeroDivisionError)
 
 
 class _Gated:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-
 from numpy.typing import NDArray
 
 from robominer_slam.evaluation.metrics import ErrorStatistics, TrajectoryErrors, trajectory_errors
