@@ -9,7 +9,7 @@ import click
 import numpy as np
 
 from robominer_slam.cli.evaluate import print_report, read_tum
-from robominer_slam.evaluation.figures import height_map_figure, path_figure, pose_graph_figure
+from robominer_slam.evaluation.figures import DriveData, write_figures
 from robominer_slam.evaluation.report import drive_report
 from robominer_slam.mapping.height_grid import height_grid
 from sim_backend.process_usage import ProcessUsage
@@ -27,9 +27,8 @@ def write_report(out: Path, truth_file: Path, scenario: int, usage: ProcessUsage
     (out / "truth.tum").write_text(truth_file.read_text(encoding="utf-8"), encoding="utf-8")
     (out / "report.json").write_text(json.dumps(report.as_dict(), indent=1) + "\n", encoding="utf-8")
     name = f"scenario {scenario}"
-    path_figure(out / "path.png", truth, odometry, slam, f"Path, {name}")
-    height_map_figure(out / "height_map.png", height_grid(points, FIGURE_CELL), f"Map of touched heights, {name}")
-    pose_graph_figure(out / "pose_graph.png", graph, report.closures.wrong, truth, f"Pose graph, {name}")
+    data = DriveData(truth, odometry, slam, graph, height_grid(points, FIGURE_CELL), report)
+    write_figures(out, data, name)
     if as_json:
         click.echo(json.dumps(report.as_dict()))
     else:

@@ -8,10 +8,12 @@ import mujoco
 import numpy as np
 import pytest
 from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
 
 from robominer_slam import layout
 from sim_backend import world
 from sim_backend.base_motion import LevelGrid, TouchDown
+from sim_backend.carriers import carrier_states
 from sim_backend.ground import HeightField
 from sim_backend.physics import TIME_STEP, PhysicsEngine, hinge_angles, rod_direction
 from sim_backend.waypoints import WaypointPath
@@ -89,6 +91,21 @@ def test_hinges_and_angles_are_each_others_inverse():
         [np.sin(inclination) * np.cos(azimuth), np.sin(inclination) * np.sin(azimuth), np.cos(inclination)], axis=-1
     )
     np.testing.assert_allclose(direction, expected, atol=1e-12)
+
+
+def test_mounts_move_as_the_body_that_carries_them():
+    """Velocities and accelerations of the mounts against finite differences of their poses, on a curve."""
+    motion = LevelGrid(WaypointPath([[0.0, 0.0, 0.3], [0.5, 0.4, 2.0]]))
+    grid, h = layout.thesis_grid(), 1e-4
+    before, now, after = (carrier_states(motion.at([3.5 + k * h]), grid) for k in (-1, 0, 1))
+    moved = (after.pose - before.pose)[0, :, :3] / (2 * h)
+    np.testing.assert_allclose(moved, now.velocity[0, :, :3], atol=1e-6)
+    changed = (after.velocity - before.velocity)[0, :, :3] / (2 * h)
+    np.testing.assert_allclose(changed, now.acceleration[0, :, :3], atol=1e-5)
+    turned = Rotation.from_quat(now.pose[0, :, 3:], scalar_first=True)
+    np.testing.assert_allclose(turned.as_matrix(), now.R[0], atol=1e-12)
+    spin = (turned.inv() * Rotation.from_quat(after.pose[0, :, 3:], scalar_first=True)).as_rotvec() / h
+    np.testing.assert_allclose(spin, now.velocity[0, :, 3:], atol=1e-4)
 
 
 @pytest.fixture(scope="module")

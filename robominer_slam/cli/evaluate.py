@@ -6,11 +6,13 @@ import json
 from pathlib import Path
 
 import click
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from robominer_slam.evaluation.report import ERROR_COLUMNS, DriveReport, drive_report, report_rows
 from robominer_slam.evaluation.trajectory import Trajectory, parse_tum
+from robominer_slam.mapping.height_grid import height_grid
 
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 
@@ -53,9 +55,11 @@ def evaluate(
     except ValueError as error:
         raise click.UsageError(str(error)) from error
     if figure is not None:
-        from robominer_slam.evaluation.figures import path_figure  # matplotlib is in the extras only
+        from robominer_slam.evaluation.figures import DriveData, path_figure  # matplotlib is in the extras only
 
-        path_figure(figure, trajectories["truth"], trajectories["odom"], trajectories["slam"], slam.stem)
+        empty = height_grid(np.zeros((0, 3)), 1.0)
+        order = (trajectories["truth"], trajectories["odom"], trajectories["slam"])
+        path_figure(figure, DriveData(*order, graph, empty, report), slam.stem)
     if as_json:
         click.echo(json.dumps(report.as_dict()))
     else:
