@@ -37,12 +37,21 @@ from sim_backend.odometry import BiasedOdometry
 FloatArray = NDArray[np.float64]
 
 GRID: dict[str, tuple[float | str, ...]] = {
-    "odometry_sigma": (0.0, 0.003, 0.01, 0.03),
-    "min_travel": (1.0, 2.0, 4.0),
+    "odometry_sigma": (0.0, 0.003, 0.01, 0.02, 0.03),
+    "min_travel": (0.5, 1.0, 2.0, 4.0),
     "correspondence_distance": (0.05, 0.1, 0.2, 0.5),
-    "closure_spacing": (0.0, 0.3, 1.0),
-    "scan_voxel": (0.0, 0.02, 0.05),
+    "closure_spacing": (0.0, 0.15, 0.3, 1.0),
+    "scan_voxel": (0.0, 0.02, 0.05, 0.08),
     "kernel": ("none", "huber", "cauchy"),
+}
+#: Where the search starts: guesses by hand.
+START: dict[str, float | str] = {
+    "odometry_sigma": 0.01,
+    "min_travel": 4.0,
+    "correspondence_distance": 0.1,
+    "closure_spacing": 0.3,
+    "scan_voxel": 0.02,
+    "kernel": "huber",
 }
 LATENCY_NS = 500_000_000
 
@@ -124,7 +133,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recording", type=Path)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument("--rounds", type=int, default=2)
     parser.add_argument("--workers", type=int, default=2)
     arguments = parser.parse_args()
     drive = load(arguments.recording, arguments.seeds)
@@ -132,7 +141,7 @@ def main() -> None:
         [np.linalg.norm((poses - drive.truth)[:, :2, 3], axis=1).mean() for poses in drive.odometry.values()]
     )
     print(f"odometry alone: {odometry:.3f} m over {len(arguments.seeds)} seeds, {len(drive.stamps_ns)} frames")
-    best = {name: getattr(ThesisSection(), name) for name in GRID}
+    best = dict(START)
     known: dict[tuple[float | str, ...], tuple[float, float]] = {}
     with ProcessPoolExecutor(arguments.workers) as pool:
         for round_number in range(1, arguments.rounds + 1):

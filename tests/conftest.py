@@ -10,6 +10,8 @@ import pytest
 from cobs import cobs
 from hypothesis import settings
 
+import robominer_slam  # noqa: F401 - first: it sets BLAS to one thread before numpy is loaded
+
 settings.register_profile("default", deadline=None, max_examples=60)
 settings.load_profile("default")
 

@@ -148,12 +148,12 @@ class ThesisSection(Section):
     resolution: float = parameter(0.1, "m", "thesis 3.4.4: registration resolution", low=0.005, high=1.0)
     search_radius: float = parameter(0.75, "m", "thesis 3.4.4: candidates within it", low=0.05, high=20.0)
     max_fitness: float = parameter(0.016, "m2", "thesis 3.4.4: mean squared distance", low=1e-6, high=1.0)
-    scan_voxel: float = parameter(0.02, "m", "voxel filter per scan: by search", low=0.0, high=0.5)
-    correspondence_distance: float = parameter(0.1, "m", "by search", low=0.01, high=10.0)
+    scan_voxel: float = parameter(0.05, "m", "voxel filter per scan: by search", low=0.0, high=0.5)
+    correspondence_distance: float = parameter(0.1, "m", "of points in a match: by search", low=0.01, high=10.0)
     min_travel: float = parameter(
-        4.0, "m", "driven since the candidate before a closure: by search", low=0.0, high=100.0
+        1.0, "m", "driven since the candidate before a closure: by search", low=0.0, high=100.0
     )
-    closure_spacing: float = parameter(0.3, "m", "driven between two closures: by search", low=0.0, high=100.0)
+    closure_spacing: float = parameter(0.0, "m", "driven between two closures: by search", low=0.0, high=100.0)
     kernel: Literal["none", "huber", "cauchy"] = parameter("huber", "", "kernel of the closures: by search")
     odometry_sigma: float = parameter(
         0.01,
