@@ -97,6 +97,14 @@ def test_algorithms_take_only_measurements_from_the_drivers():
             assert used <= DRIVERS_FOR_ALGORITHMS, f"{path.relative_to(ROOT)} imports {used}"
 
 
+def test_io_imports_no_algorithms():
+    algorithms = {"robominer_slam.slam", "robominer_slam.estimation", "robominer_slam.mapping"}
+    for place in ("drivers", "robominer_slam/publishing", "robominer_slam/sources"):
+        for path in files(place):
+            used = {".".join(name.split(".")[:2]) for name in imports(path)}
+            assert not used & algorithms, f"{path.relative_to(ROOT)} imports {used & algorithms}"
+
+
 def test_the_simulator_shares_no_code_with_the_decoders():
     for path in files("sim_backend"):
         wrong = {name for name in imports(path) if name.startswith(("drivers.framed", "drivers.readings"))}

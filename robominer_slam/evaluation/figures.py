@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib as mpl
 import numpy as np
@@ -32,7 +32,7 @@ MARGIN_M = 0.15
 #: A closure is drawn as an arc this high: closures of a drive along a line would lie upon each other.
 ARC_M = 0.25
 #: Room for the legend between axes and title, points.
-TITLE_PAD = 24.0
+TITLE_PAD = 36.0
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def draw_path(axes: Axes, data: DriveData) -> None:
     ):
         axes.plot(trajectory.T[:, 0, 3], trajectory.T[:, 1, 3], style, color=colour, linewidth=width, label=label)
     axes.plot(*data.truth.T[0, :2, 3], "o", color=TRUTH, markersize=6, label="start")
-    _plan(axes, [data.truth, data.odometry, data.slam])
+    _plan(axes)
 
 
 def draw_height_map(figure: Figure, axes: Axes, data: DriveData) -> None:
@@ -66,7 +66,7 @@ def draw_height_map(figure: Figure, axes: Axes, data: DriveData) -> None:
     extent = (x0, x0 + nx * data.grid.cell, y0, y0 + ny * data.grid.cell)
     image = axes.imshow(data.grid.height, origin="lower", extent=extent, cmap="viridis", interpolation="nearest")
     figure.colorbar(image, ax=axes, label="height in map (m)", shrink=0.9)
-    _plan(axes, [])
+    _plan(axes, "box")
 
 
 def draw_pose_graph(axes: Axes, data: DriveData) -> None:
@@ -90,7 +90,7 @@ def draw_pose_graph(axes: Axes, data: DriveData) -> None:
     if position:
         nodes = np.array(list(position.values()))
         axes.plot(nodes[:, 0], nodes[:, 1], ".", color=SLAM, markersize=5, label=f"keyframes ({len(nodes)})")
-    _plan(axes, [data.truth, data.slam])
+    _plan(axes)
 
 
 def draw_errors(axes: Axes, data: DriveData) -> None:
@@ -144,15 +144,12 @@ def path_figure(path: Path, data: DriveData, title: str) -> None:
     _save(figure, path)
 
 
-def _plan(axes: Axes, trajectories: Sequence[Trajectory]) -> None:
-    axes.set_aspect("equal")
+def _plan(axes: Axes, adjustable: Literal["box", "datalim"] = "datalim") -> None:
+    # The box of a path stays as it was laid out, its limits give way; the map's limits are the map's.
+    axes.set_aspect("equal", adjustable=adjustable)
     axes.set_xlabel("x in map (m)")
     axes.set_ylabel("y in map (m)")
     axes.grid(visible=True, color="#dddddd", linewidth=0.6)
-    if trajectories:
-        low, high = _extent(trajectories)
-        axes.set_xlim(low[0], high[0])
-        axes.set_ylim(low[1], high[1])
 
 
 def _extent(trajectories: Sequence[Trajectory]) -> tuple[FloatArray, FloatArray]:
@@ -163,9 +160,9 @@ def _extent(trajectories: Sequence[Trajectory]) -> tuple[FloatArray, FloatArray]
 
 
 def _plan_height(data: DriveData) -> float:
-    """Height in inches at which a plan view fills the width, within reason; the legend's line included."""
+    """Height in inches at which a plan view fills the width, within reason; the legend's lines included."""
     low, high = _extent([data.truth, data.odometry, data.slam])
-    return float(np.clip((WIDTH_IN - 1.5) * (high[1] - low[1]) / (high[0] - low[0]) + 1.1, 2.4, 8.0))
+    return float(np.clip((WIDTH_IN - 1.5) * (high[1] - low[1]) / (high[0] - low[0]) + 1.6, 3.2, 8.0))
 
 
 def _arc(start: FloatArray, end: FloatArray, height: float) -> FloatArray:
@@ -177,7 +174,7 @@ def _arc(start: FloatArray, end: FloatArray, height: float) -> FloatArray:
 
 
 def _legend(axes: Axes) -> None:
-    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=5, fontsize="small", frameon=False)
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, fontsize="small", frameon=False)
 
 
 def _save(figure: Figure, path: Path) -> Path:
