@@ -23,6 +23,8 @@ FloatArray = NDArray[np.float64]
 
 #: Without contacts for this long there is nothing to localise on.
 BLIND_NS = 2_000_000_000
+#: Without odometry for this long the robot may be anywhere near: the pose is not known.
+ODOMETRY_TIMEOUT_NS = 2_000_000_000
 
 
 class Pipeline:
@@ -53,6 +55,7 @@ class Pipeline:
         self.runner = runner
         self.paused = False
         self.wrong_size_frames = 0
+        self.stale_frames = 0
         self._dead_reckoning = dead_reckoning
         self._contact_model = contact_model
         self._composite = composite_scan
@@ -62,6 +65,7 @@ class Pipeline:
         self._odometry_at_result: FloatArray | None = None
         self._odometry_of_keyframe: dict[int, FloatArray] = {}
         self._contact_ns: int | None = None
+        self._odometry_ns: int | None = None
         self._last_frame: HallFrame | None = None
 
     def add(self, device: str, measurement: Measurement) -> list[FrameResult]:
@@ -96,20 +100,27 @@ class Pipeline:
 
     def _process(self, due: list[tuple[str, Measurement]]) -> list[FrameResult]:
         results = []
-        for device, measurement in due:
+        for device, taken in due:
+            measurement = taken
             if isinstance(measurement, HallFrame):
                 result = self._frame(measurement)
                 if result is not None:
                     results.append(result)
-            elif isinstance(measurement, ImuSample):
-                self._dead_reckoning.add(self._in_base(device, measurement))
-            else:
-                self._dead_reckoning.add(measurement)
+                continue
+            if isinstance(measurement, ImuSample):
+                measurement = self._in_base(device, measurement)
+            elif self._dead_reckoning.measures_motion(measurement):
+                self._odometry_ns = measurement.stamp_ns
+            self._dead_reckoning.add(measurement)
         return results
 
     def _frame(self, frame: HallFrame) -> FrameResult | None:
         if frame.valid.size != self.angle_estimator.count:
             self.wrong_size_frames += 1
+            return None
+        if self._last_frame is not None and frame.stamp_ns <= self._last_frame.stamp_ns:
+            # A burst out of order, or a device clock that jumped back: poses only go forward in time.
+            self.stale_frames += 1
             return None
         self._last_frame = frame
         stamp = frame.stamp_ns
@@ -165,6 +176,8 @@ class Pipeline:
         return covariance
 
     def _state(self, stamp: int) -> LocalizationState:
+        if self._odometry_ns is None or stamp - self._odometry_ns > ODOMETRY_TIMEOUT_NS:
+            return "lost"
         if self.runner is None or self._contact_ns is None or stamp - self._contact_ns > BLIND_NS or self.paused:
             return "dead_reckoning"
         return "tracking"

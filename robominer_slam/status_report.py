@@ -48,6 +48,7 @@ def slam_diagnostic(
         "late_measurements": str(pipeline.reorder.late),
         "dropped_measurements": str(pipeline.reorder.dropped),
         "wrong_size_frames": str(pipeline.wrong_size_frames),
+        "stale_frames": str(pipeline.stale_frames),
         "out_of_range_readings": str(pipeline.angle_estimator.out_of_range),
     }
     if pipeline.runner is not None:
@@ -61,6 +62,8 @@ def slam_diagnostic(
     values["contacts"] = str(len(frame.contacts.index))
     if frame_age_s > STALE_S:
         return Diagnostic("localization", Level.STALE, f"no whisker frame for {frame_age_s:.1f} s", values)
+    if frame.state == "lost":
+        return Diagnostic("localization", Level.ERROR, "lost: no odometry for 2 s or more", values)
     return Diagnostic("localization", Level.OK, frame.state, values)
 
 

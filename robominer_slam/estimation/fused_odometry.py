@@ -110,6 +110,10 @@ class FusedOdometry:
             case _:
                 pass
 
+    def measures_motion(self, measurement: Measurement) -> bool:
+        """The screws do; a gyro alone does not."""
+        return isinstance(measurement, ScrewAngles | ScrewSpeeds)
+
     def state_at(self, stamp_ns: int) -> OdometryState:
         """The state at a time that is not before the last measurement's."""
         self._predict(stamp_ns)

@@ -51,6 +51,10 @@ class IntegratedOdometry:
         self._grow_covariance(interval)
         self._pose = advance(self._pose, self._velocity, interval)
 
+    def measures_motion(self, measurement: Measurement) -> bool:
+        """Only a ready-made odometry does here."""
+        return isinstance(measurement, OdometrySample)
+
     def state_at(self, stamp_ns: int) -> OdometryState:
         """The pose carried on from the last sample with its velocity, without keeping that."""
         pose = self._pose

@@ -41,6 +41,10 @@ class DeadReckoning(Protocol):
         """Take a measurement; kinds that are of no use here are ignored."""
         ...
 
+    def measures_motion(self, measurement: Measurement) -> bool:
+        """Whether this kind of measurement says how fast the robot moves: without it, the pose is soon not known."""
+        ...
+
     def state_at(self, stamp_ns: int) -> OdometryState:
         """The state at a time that is not before the last measurement's."""
         ...
