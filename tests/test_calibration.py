@@ -10,7 +10,7 @@ import pytest
 from calibration.angle_estimator import AngleEstimator
 from calibration.file_format import CalibrationFileError, check_fits, from_text, to_text
 from calibration.fit import FitError, FitReport, JigSamples, direction_error, fit_jig
-from calibration.polynomial import angles_from_tilt, monomials, tilt_from_angles
+from calibration.polynomial import angles_from_tilt, dipole_coordinates, monomials, tilt_from_angles
 
 
 def dipole_field(inclination: np.ndarray, azimuth: np.ndarray, moment: float = 900.0, gap: float = 4.0) -> np.ndarray:
@@ -135,3 +135,14 @@ def test_a_sweep_that_does_not_cover_enough_is_refused(keep, expected):
     rows = [r for r in jig_rows(np.random.default_rng(0), [(0, 0)]) if keep(r)]
     with pytest.raises(FitError, match=expected):
         fit_jig(JigSamples.from_rows(rows), 1, 1)
+
+
+def test_dipole_coordinates_of_an_ideal_dipole_are_its_tilt():
+    inclination, azimuth = np.array([0.0, 0.3, 0.9, 1.3]), np.array([0.0, 2.0, -1.0, 3.0])
+    field = 20.0 * np.column_stack(
+        [-np.sin(inclination) * np.cos(azimuth), -np.sin(inclination) * np.sin(azimuth), 2.0 * np.cos(inclination)]
+    )
+    for polarity in (1.0, -1.0):
+        rest = polarity * np.array([0.0, 0.0, 40.0])
+        found = dipole_coordinates(polarity * field, np.broadcast_to(rest, (4, 3)))
+        np.testing.assert_allclose(found[:, :2], -tilt_from_angles(inclination, azimuth), atol=1e-9)
