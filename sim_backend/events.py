@@ -19,13 +19,13 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class WhiskerEvent:
-    """One frame of the array: fields, shape (rows * cols, 3), mT; valid, shape (rows * cols,); what is true."""
+    """One frame of the array: fields, shape (rows * cols, 3), mT; valid, shape (rows * cols,); the truth or None."""
 
     time_ns: int
     ready_ns: int
     field_mT: FloatArray
     valid: NDArray[np.bool_]
-    truth: ArrayReading
+    truth: ArrayReading | None
 
 
 @dataclass(frozen=True, slots=True)
