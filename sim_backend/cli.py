@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import click
@@ -16,8 +16,10 @@ Example: drive scenario 1, and run the daemon on it in another terminal:
   robominer-slam simulate --scenario 1 --out out/sim
   robominer-slam run --config out/sim/config.toml
 \b
-A recording instead, as fast as it goes:
-  robominer-slam simulate --scenario 3 --out out/sim --record out/scenario3.mcap
+A recording instead, as fast as it goes; the same with another odometry; and served on ports:
+  robominer-slam simulate --scenario 3 --out out/sim --record drive.mcap
+  robominer-slam simulate --from drive.mcap --odometry-seed 7 --out drive7.mcap
+  robominer-slam simulate --from drive7.mcap --source odometry --out out/again
 """
 
 
@@ -28,13 +30,30 @@ A recording instead, as fast as it goes:
     "--engine", type=click.Choice(["physics"]), default="physics", show_default=True, help="What moves the whiskers."
 )
 @click.option("--seed", default=1, show_default=True, help="Tolerances, biases, noise and slip of all sensors.")
-@click.option("--odometry-seed", default=0, show_default=True, help="Bias and noise of the ready-made odometry.")
+@click.option("--odometry-seed", type=int, help="Bias and noise of the ready-made odometry.  [default: 0]")
+@click.option(
+    "--odometry-grade",
+    type=click.Choice(["thesis", "half", "double"]),
+    default="thesis",
+    show_default=True,
+    help="Size of the ready-made odometry's bias and noise.",
+)
+@click.option(
+    "--imu", type=click.Choice(["bno080", "3dm-cv7"]), default="bno080", show_default=True, help="Grade of the IMU."
+)
+@click.option("--imu-mount", type=(float, float, float), default=(0.0, 0.0, 0.0), help="Roll, pitch, yaw, deg.")
+@click.option(
+    "--from",
+    "source_file",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="Serve a recording instead of simulating; with --odometry-seed and --out FILE.mcap, write it anew.",
+)
 @click.option(
     "--out",
-    type=click.Path(file_okay=False, path_type=Path),
+    type=click.Path(path_type=Path),
     default=Path("out/sim"),
     show_default=True,
-    help="Folder for ports, configuration, calibration and ground truth.",
+    help="Folder for ports, configuration, calibration and ground truth; with --from and --odometry-seed a file.",
 )
 @click.option(
     "--rate",
@@ -73,7 +92,11 @@ def simulate(
     scenario: int,
     engine: str,
     seed: int,
-    odometry_seed: int,
+    odometry_seed: int | None,
+    odometry_grade: str,
+    imu: str,
+    imu_mount: tuple[float, float, float],
+    source_file: Path | None,
     out: Path,
     rate: float,
     source: str,
@@ -89,7 +112,11 @@ def simulate(
     It stands still until the ports are read (or --wait is over), then for two more seconds, drives, and ends.
     """
     # MuJoCo and magpylib take a second to import: not for --help.
+    from drivers.recording_reader import Recording
+    from sim_backend import imu as imus
+    from sim_backend import odometry as odometries
     from sim_backend import simulate as simulation
+    from sim_backend.recorded_drive import RecordedDriveError, with_other_odometry
     from sim_backend.robot import RobotSettings
     from sim_backend.world import WorldError
 
@@ -99,7 +126,13 @@ def simulate(
         world=world,
         scenario=scenario,
         engine=engine,
-        robot=RobotSettings(seed=seed, odometry_seed=odometry_seed, max_time=max_time),
+        robot=RobotSettings(
+            seed=seed,
+            odometry_seed=odometry_seed or 0,
+            max_time=max_time,
+            imu=replace(imus.GRADES[imu], mount_rpy_deg=imu_mount),
+            odometry=odometries.GRADES[odometry_grade],
+        ),
         rate=rate,
         wait=wait,
         source=source,
@@ -115,9 +148,19 @@ def simulate(
             click.echo(f"{name:10s} {port}")
         click.echo(f"configuration: {report.configuration}")
         click.echo(f"ground truth:  {report.truth}")
-        click.echo(f"scenario {scenario}: {report.length:.1f} m in {report.duration / rate:.0f} s")
+        driven = source_file.name if source_file is not None else f"scenario {scenario}"
+        click.echo(f"{driven}: {report.length:.1f} m in {report.duration / rate:.0f} s")
 
     try:
+        if source_file is not None and odometry_seed is not None:
+            if out.suffix != ".mcap":
+                raise click.UsageError(f"--out {out}: with --from and --odometry-seed expected a file, FILE.mcap")
+            samples = with_other_odometry(Recording(source_file), odometry_seed, out)
+            if as_json:
+                _print_json({"event": "recorded", "file": out, "messages": {"odometry/twist": samples}})
+            else:
+                click.echo(f"{out}: {source_file} with {samples} odometry samples of seed {odometry_seed}")
+            return
         if recording is not None:
             counts = simulation.record_drive(settings, recording)
             if as_json:
@@ -125,8 +168,13 @@ def simulate(
             else:
                 click.echo(f"{recording}: " + ", ".join(f"{n} on {topic}" for topic, n in counts.items()))
             return
-        report = simulation.serve(settings, ready)
-    except (WorldError, OSError) as error:
+        if source_file is not None:
+            out.mkdir(parents=True, exist_ok=True)
+            drive = simulation.recorded_drive(source_file, settings.robot.screws.ticks_per_turn)
+        else:
+            drive = simulation.simulated_drive(settings)
+        report = simulation.serve(settings, drive, ready)
+    except (WorldError, RecordedDriveError, OSError) as error:
         raise click.UsageError(str(error)) from error
     if as_json:
         _print_json({"event": "done", **asdict(report)})

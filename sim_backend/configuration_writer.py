@@ -20,9 +20,10 @@ CALIBRATION_DATE = "2021-06-01"
 
 def configuration_text(
     ports: Mapping[str, Path],
-    layout: WhiskerLayout,
+    layout: str,
     *,
     ticks_per_turn: int,
+    mount_rpy_deg: tuple[float, float, float],
     source: str,
     method: str | None,
     store: Path,
@@ -33,8 +34,9 @@ def configuration_text(
 
     Args:
         ports: device name (whiskers, imu, screws, odometry) to port; one that the source does not use is left out.
-        layout: of the array.
+        layout: of the array: a built-in name or a file.
         ticks_per_turn: of the screws' encoders.
+        mount_rpy_deg: of the IMU.
         source: `fused` or `odometry`.
         method: of SLAM; None leaves the daemon's default.
         store: where the daemon keeps its map.
@@ -43,7 +45,7 @@ def configuration_text(
     """
     document = tomlkit.document()
     document.add(tomlkit.comment("Written by `robominer-slam simulate` for the simulated robot."))
-    document["robot"] = {"id": robot_id, "layout": layout.name, "role": "all"}
+    document["robot"] = {"id": robot_id, "layout": layout, "role": "all"}
     devices = tomlkit.aot()
     for name, port in ports.items():
         if name not in USED_BY_SOURCE[source]:
@@ -54,6 +56,8 @@ def configuration_text(
             device["calibration"] = CALIBRATION
         if name == "screws":
             device["ticks_per_turn"] = ticks_per_turn
+        if name == "imu" and any(mount_rpy_deg):
+            device["mount_rpy_deg"] = list(mount_rpy_deg)
         devices.append(device)
     document["device"] = devices
     document["estimation"] = {"source": source}

@@ -32,6 +32,14 @@ class OdometrySettings:
     deviation: tuple[float, float, float] = (0.05, 0.05, 0.05)
 
 
+#: Grades by name: half and double the thesis's.
+GRADES = {
+    "thesis": OdometrySettings(),
+    "half": OdometrySettings(bias_range=(0.0005, 0.0025), deviation=(0.025, 0.025, 0.025)),
+    "double": OdometrySettings(bias_range=(0.002, 0.010), deviation=(0.1, 0.1, 0.1)),
+}
+
+
 class BiasedOdometry:
     """Draws its biases once from the seed, then turns true motion into body velocities, in order."""
 

@@ -14,7 +14,8 @@ from robominer_slam.layout import WhiskerLayout
 from sim_backend import world as worlds
 from sim_backend.base_motion import BaseMotion, LevelGrid
 from sim_backend.events import EncoderEvent, Event, ImuEvent, OdometryEvent, TruthEvent, WhiskerEvent
-from sim_backend.imu import GRAVITY, Imu, ImuSettings
+from sim_backend.hall_drift import DriftSettings, HallDrift
+from sim_backend.imu import Imu, ImuSettings
 from sim_backend.magnet import HallArray
 from sim_backend.odometry import BiasedOdometry, OdometrySettings, mean_body_velocity
 from sim_backend.physics import Engine, PhysicsEngine
@@ -40,7 +41,7 @@ class RobotSettings:
         frame_interval_us: time between two whisker frames, us.
         sensor_period_us: time between two sensors of a frame, us.
         max_time: where to cut the drive short, s; None drives to the end.
-        drive, imu, screws, odometry: settings of the parts.
+        drive, imu, screws, odometry, drift: settings of the parts.
     """
 
     seed: int = 1
@@ -52,6 +53,7 @@ class RobotSettings:
     imu: ImuSettings = field(default_factory=ImuSettings)
     screws: ScrewSettings = field(default_factory=ScrewSettings)
     odometry: OdometrySettings = field(default_factory=OdometrySettings)
+    drift: DriftSettings = field(default_factory=DriftSettings)
 
 
 class SimulatedRobot:
@@ -70,6 +72,7 @@ class SimulatedRobot:
         self.hall = HallArray(layout, settings.seed)
         self._engine = engine
         self._hall_noise = stream(settings.seed, "hall")
+        self._drift = HallDrift(settings.seed, layout.count, settings.drift)
         self._imu = Imu(settings.seed, settings.imu)
         self._screws = ScrewEncoders(settings.seed, settings.screws)
         self._odometry = BiasedOdometry(settings.odometry_seed, settings.odometry)
@@ -105,7 +108,8 @@ class SimulatedRobot:
     def _frame(self, start_ns: int) -> tuple[TruthEvent, WhiskerEvent]:
         base = self.motion.at([start_ns / NANOSECONDS])
         reading = self._engine.read()
-        field_mT = self.hall.sample(self.hall.field(reading.hinge, base.R[0]), self._hall_noise)
+        field = self._drift.apply(self.hall.field(reading.hinge, base.R[0]), self.settings.frame_interval_us * 1e-6)
+        field_mT = self.hall.sample(field, self._hall_noise)
         field_mT[~self.layout.present] = 0.0
         truth = TruthEvent(
             start_ns,
@@ -124,7 +128,7 @@ class SimulatedRobot:
             return []
         motion = self.motion.at(stamps / NANOSECONDS)
         gyro, acceleration = self._imu.sample(motion)
-        gravity = GRAVITY * motion.R[:, 2, :]
+        gravity = self._imu.gravity(motion)
         return [
             ImuEvent(int(t), int(t), w, f, g) for t, w, f, g in zip(stamps, gyro, acceleration, gravity, strict=True)
         ]

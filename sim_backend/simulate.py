@@ -11,10 +11,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 
+import numpy as np
+
+from drivers.recording_reader import Recording
 from robominer_slam import layout as layouts
-from sim_backend.configuration_writer import CONFIGURATION, USED_BY_SOURCE, configuration_text, write_calibration
+from robominer_slam.layout import WhiskerLayout
+from sim_backend.configuration_writer import (
+    CALIBRATION,
+    CONFIGURATION,
+    USED_BY_SOURCE,
+    configuration_text,
+    write_calibration,
+)
 from sim_backend.device_server import DeviceServer, StartTime
-from sim_backend.events import TruthEvent
+from sim_backend.events import Event, TruthEvent
+from sim_backend.recorded_drive import RecordedDriveError, events_of
 from sim_backend.recorder import record
 from sim_backend.robot import RobotSettings, SimulatedRobot, build_robot
 from sim_backend.serial_devices import EVENT_OF_DEVICE, ClockSettings, plug_in
@@ -23,6 +34,7 @@ from sim_backend.truth import TruthFile
 TRUTH = "ground_truth.txt"
 PORTS = "dev"
 STORE = "map.db"
+LAYOUT = "layout.json"
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,35 +89,99 @@ class DriveReport:
     seconds: float
 
 
-def serve(settings: SimulationSettings, on_ready: Callable[[ReadyReport], None]) -> DriveReport:
-    """Serve one drive on pseudo-terminals; ends when it has been driven, or on SIGTERM or SIGINT.
+@dataclass(frozen=True)
+class Drive:
+    """What is served: a simulated robot's drive or a recorded one.
+
+    Attributes:
+        layout: of the array.
+        calibration: text of the array's calibration file.
+        sensor_period_us: time between two sensors of a frame.
+        ticks_per_turn: of the screws' encoders.
+        events: starts the drive.
+        duration: s.
+        length: of the way driven, m.
+    """
+
+    layout: WhiskerLayout
+    calibration: str
+    sensor_period_us: int
+    ticks_per_turn: int
+    events: Callable[[], Iterator[Event]]
+    duration: float
+    length: float
+
+
+def simulated_drive(settings: SimulationSettings) -> Drive:
+    """A robot in a world; its jig table and calibration are written into the folder.
 
     Raises:
         WorldError: no such world or scenario.
+        OSError: a file cannot be written.
+    """
+    robot = _build(settings)
+    calibration = write_calibration(settings.out.absolute(), robot.layout, settings.robot.seed)
+    return Drive(
+        robot.layout,
+        calibration,
+        settings.robot.sensor_period_us,
+        settings.robot.screws.ticks_per_turn,
+        robot.events,
+        robot.duration,
+        robot.motion.length,
+    )
+
+
+def recorded_drive(path: Path, ticks_per_turn: int) -> Drive:
+    """A recording driven again; layout and calibration are those that it carries.
+
+    Raises:
+        RecordingError, RecordedDriveError, LayoutError: it cannot be used; one line says why.
+    """
+    recording = Recording(path)
+    attachments = recording.attachments()
+    missing = [name for name in (LAYOUT, CALIBRATION) if name not in attachments]
+    if missing:
+        raise RecordedDriveError(f"{path}: carries no {' and no '.join(missing)}; expected them as attachments")
+    truths = np.array([truth.pose[:2] for _, truth in recording.ground_truth()]).reshape(-1, 2)
+    return Drive(
+        layouts.from_json(attachments[LAYOUT].decode("utf-8", "replace"), f"{path}:{LAYOUT}"),
+        attachments[CALIBRATION].decode("utf-8", "replace"),
+        recording.sensor_period_ns // 1000,
+        ticks_per_turn,
+        lambda: events_of(recording, ticks_per_turn),
+        recording.duration_ns * 1e-9,
+        float(np.linalg.norm(np.diff(truths, axis=0), axis=1).sum()),
+    )
+
+
+def serve(settings: SimulationSettings, drive: Drive, on_ready: Callable[[ReadyReport], None]) -> DriveReport:
+    """Serve one drive on pseudo-terminals; ends when it has been driven, or on SIGTERM or SIGINT.
+
+    Raises:
         OSError: a file or port cannot be made.
     """
     out = settings.out.absolute()
-    out.mkdir(parents=True, exist_ok=True)
-    robot = _build(settings)
-    write_calibration(out, robot.layout, settings.robot.seed)
+    (out / CALIBRATION).write_text(drive.calibration, encoding="utf-8")
+    (out / LAYOUT).write_text(layouts.to_json(drive.layout), encoding="utf-8")
     devices = plug_in(out / PORTS, tuple(EVENT_OF_DEVICE), time.monotonic_ns(), settings.clocks)
     ports = {name: device.path for name, device in devices.items()}
-    (out / CONFIGURATION).write_text(_configuration(settings, robot, out), encoding="utf-8")
+    (out / CONFIGURATION).write_text(_configuration(settings, drive, out), encoding="utf-8")
     with TruthFile(out / TRUTH) as truth:
 
         def write_truth(event: TruthEvent, start: StartTime) -> None:
             truth.write(event, start.unix(event.time_ns))
 
-        array = (robot.layout.rows, robot.layout.cols, settings.robot.sensor_period_us)
+        array = (drive.layout.rows, drive.layout.cols, drive.sensor_period_us)
         server = DeviceServer(devices, array, rate=settings.rate, on_truth=write_truth)
         try:
             with _stop_on_signals(server.stop) as stopped:
-                on_ready(ReadyReport(ports, out / CONFIGURATION, out / TRUTH, robot.duration, robot.motion.length))
+                on_ready(ReadyReport(ports, out / CONFIGURATION, out / TRUTH, drive.duration, drive.length))
                 # A daemon opens the ports of its configuration only: it need not ping the others.
                 host_came = server.wait_for_host(settings.wait, USED_BY_SOURCE[settings.source])
                 begin = time.monotonic()
                 if not stopped.is_set():
-                    server.serve(robot.events())
+                    server.serve(drive.events())
         finally:
             server.close()
     return DriveReport(
@@ -131,20 +207,18 @@ def record_drive(
         OSError: a file cannot be made.
     """
     out = settings.out.absolute()
-    out.mkdir(parents=True, exist_ok=True)
-    robot = _build(settings)
-    calibration = write_calibration(out, robot.layout, settings.robot.seed)
-    (out / CONFIGURATION).write_text(_configuration(settings, robot, out), encoding="utf-8")
-    duration_ns = 1e9 * robot.duration
+    drive = simulated_drive(settings)
+    (out / CONFIGURATION).write_text(_configuration(settings, drive, out), encoding="utf-8")
+    duration_ns = 1e9 * drive.duration
     return record(
-        robot.events(),
+        drive.events(),
         path,
-        array=(robot.layout.rows, robot.layout.cols, settings.robot.sensor_period_us),
+        array=(drive.layout.rows, drive.layout.cols, drive.sensor_period_us),
         attachments={
-            "layout.json": layouts.to_json(robot.layout).encode(),
-            "calibration.json": calibration.encode(),
+            LAYOUT: layouts.to_json(drive.layout).encode(),
+            CALIBRATION: drive.calibration.encode(),
             # Without the folder, so that the same seed gives the same recording anywhere.
-            "config.toml": _configuration(settings, robot, Path()).encode(),
+            CONFIGURATION: _configuration(settings, drive, Path()).encode(),
         },
         metadata={
             "world": settings.world,
@@ -158,14 +232,17 @@ def record_drive(
 
 
 def _build(settings: SimulationSettings) -> SimulatedRobot:
+    settings.out.mkdir(parents=True, exist_ok=True)
     return build_robot(settings.world, settings.scenario, settings.engine, settings.robot)
 
 
-def _configuration(settings: SimulationSettings, robot: SimulatedRobot, folder: Path) -> str:
+def _configuration(settings: SimulationSettings, drive: Drive, folder: Path) -> str:
+    built_in = drive.layout.name in layouts.BUILT_IN
     return configuration_text(
         {name: folder / PORTS / name for name in EVENT_OF_DEVICE},
-        robot.layout,
-        ticks_per_turn=settings.robot.screws.ticks_per_turn,
+        drive.layout.name if built_in else LAYOUT,
+        ticks_per_turn=drive.ticks_per_turn,
+        mount_rpy_deg=settings.robot.imu.mount_rpy_deg,
         source=settings.source,
         method=settings.method,
         store=folder / STORE,

@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import trapezoid
+from scipy.spatial.transform import Rotation
 
 from sim_backend.base_motion import LevelGrid
-from sim_backend.imu import Imu, ImuSettings
+from sim_backend.hall_drift import DriftSettings, HallDrift
+from sim_backend.imu import GRADES, Imu, ImuSettings
 from sim_backend.odometry import BiasedOdometry, OdometrySettings, mean_body_velocity
 from sim_backend.waypoints import WaypointPath
 
 CURVE = LevelGrid(WaypointPath([[0, 0, 0.3], [1.0, 0.5, 2.0], [0.2, 0.9, -1.0]]))
 STILL = LevelGrid(WaypointPath([[0, 0, 0.7]]))
-QUIET = ImuSettings(gyro_noise=0.0, gyro_bias=0.0, gyro_bias_drift=0.0, acceleration_noise=0.0, acceleration_bias=0.0)
+QUIET = ImuSettings(
+    gyro_step=0.0,
+    acceleration_step=0.0,
+    gyro_noise=0.0,
+    gyro_bias=0.0,
+    gyro_bias_drift=0.0,
+    acceleration_noise=0.0,
+    acceleration_bias=0.0,
+)
 
 
 def integrate(velocity, dt, start):
@@ -89,3 +101,41 @@ def test_touch_down_ends_smoothly_at_the_start():
     np.testing.assert_allclose(np.gradient(states.position, 0.001, axis=0)[5:-5], states.velocity[5:-5], atol=1e-3)
     assert states.position[0, 2] > 0.1
     np.testing.assert_allclose(states.position[-1], 0.0, atol=1e-12)
+
+
+def test_a_mounted_imu_measures_in_its_own_axes():
+    time = np.arange(0.0, 6.0, 0.01)
+    motion = CURVE.at(time)
+    level_gyro, level_force = Imu(1, QUIET).sample(motion)
+    gyro, force = Imu(1, replace(QUIET, mount_rpy_deg=(180.0, 0.0, 90.0))).sample(motion)
+    R = Rotation.from_euler("ZYX", [90, 0, 180], degrees=True).as_matrix()
+    np.testing.assert_allclose(gyro @ R.T, level_gyro, atol=1e-12)
+    np.testing.assert_allclose(force @ R.T, level_force, atol=1e-12)
+    np.testing.assert_allclose(force[0], [0, 0, -9.81], atol=1e-12)
+
+
+def test_the_robots_own_flavour_has_no_gravity():
+    _, acceleration = Imu(1, replace(QUIET, gravity_free=True)).sample(STILL.at(np.arange(5) / 100))
+    np.testing.assert_allclose(acceleration, 0.0, atol=1e-12)
+
+
+def test_a_bno080_reports_in_steps_and_a_cv7_is_quieter():
+    motion = STILL.at(np.arange(5000) / 100)
+    gyro, force = Imu(3).sample(motion)
+    np.testing.assert_allclose(gyro * 512, np.round(gyro * 512), atol=1e-9)
+    np.testing.assert_allclose(force * 256, np.round(force * 256), atol=1e-9)
+    better, _ = Imu(3, GRADES["3dm-cv7"]).sample(motion)
+    assert better.std() < gyro.std() / 2
+
+
+def test_drift_starts_at_zero_and_grows_slowly():
+    rest = np.tile([0.5, -0.5, 40.0], (64, 1))
+    drift = HallDrift(1, 64)
+    np.testing.assert_allclose(drift.apply(rest, 0.0), rest)
+    for _ in range(3600):
+        later = drift.apply(rest, 1.0)
+    walked = (later - later.mean(axis=0)).std(axis=0)
+    np.testing.assert_allclose(walked, 0.005 * 60, rtol=0.3)
+    warm = HallDrift(1, 1, DriftSettings(offset_walk=0.0))
+    strength = np.array([warm.apply(rest[:1], 60.0)[0, 2] for _ in range(2000)]) / 40.0
+    assert np.std(strength) == pytest.approx(0.0033, rel=0.25)
