@@ -134,6 +134,7 @@ class Pipeline:
         for result in backend_results:
             self._take(result)
         keyframe = self._keyframe(stamp, T_odom_base, contacts.points, odometry)
+        state = self._state(stamp)
         return FrameResult(
             stamp_ns=stamp,
             odometry=odometry,
@@ -143,7 +144,7 @@ class Pipeline:
             covariance=self._covariance(odometry),
             angles=angles,
             contacts=contacts,
-            state=self._state(stamp),
+            state=state,
             keyframe=keyframe,
             backend_results=backend_results,
         )
@@ -176,7 +177,10 @@ class Pipeline:
         return covariance
 
     def _state(self, stamp: int) -> LocalizationState:
-        if self._odometry_ns is None or stamp - self._odometry_ns > ODOMETRY_TIMEOUT_NS:
+        if self._odometry_ns is None:
+            # The map starts at the first pose, which is known by definition.
+            self._odometry_ns = stamp
+        if stamp - self._odometry_ns > ODOMETRY_TIMEOUT_NS:
             return "lost"
         if self.runner is None or self._contact_ns is None or stamp - self._contact_ns > BLIND_NS or self.paused:
             return "dead_reckoning"

@@ -22,6 +22,8 @@ CLOCK_LEARNING = 0.5
 DRAIN = 1.0
 #: Events computed ahead: two seconds, so that a busy moment does not stop the sensors.
 AHEAD = 460
+#: Faults of the lines begin and end within this time of their schedule, s, where no packet is due earlier.
+POLL = 0.02
 LATE_NS = 200_000_000
 
 
@@ -66,7 +68,9 @@ class DeviceServer:
             on_truth: called for each truth event when its time has come.
         """
         self._devices, self._array, self._rate, self._on_truth = devices, array, rate, on_truth
-        self._device_of_event = {EVENT_OF_DEVICE[name]: device for name, device in devices.items()}
+        self._devices_of_event: dict[type[Event], list[SerialDevice]] = {}
+        for device in devices.values():
+            self._devices_of_event.setdefault(EVENT_OF_DEVICE[device.role], []).append(device)
         self._stop = threading.Event()
         self._abandoned = threading.Event()
         self.worst_lateness_ns = 0
@@ -76,12 +80,17 @@ class DeviceServer:
         self._stop.set()
 
     def wait_for_host(self, timeout: float, names: Iterable[str]) -> bool:
-        """Answer until a host has pinged every device of these names; False if it has not within `timeout` s."""
-        awaited = [self._devices[name] for name in names]
+        """Answer until a host wants every device of these names or roles; False if it has not within `timeout` s.
+
+        A host wants a device that it has sent a PING or a command; of those that never listen, one whose port it
+        has read or flushed.
+        """
+        wanted = set(names)
+        awaited = [device for device in self._devices.values() if wanted & {device.name, device.role}]
         deadline = time.monotonic() + timeout
         while not self._stop.is_set() and time.monotonic() < deadline:
             self._answer(0.05)
-            if all(device.pinged for device in awaited):
+            if all([device.host_came for device in awaited]):
                 self._answer_until(time.monotonic_ns() + int(1e9 * CLOCK_LEARNING))
                 return True
         return False
@@ -89,12 +98,16 @@ class DeviceServer:
     def serve(self, events: Iterator[Event]) -> StartTime:
         """Send all events when they are due, from now on; returns when the last is sent or after `stop`."""
         ahead: queue.Queue[Event | BaseException | None] = queue.Queue(AHEAD)
-        producer = threading.Thread(target=self._produce, args=(events, ahead), name="simulation", daemon=True)
+        producer = threading.Thread(
+            target=self._produce, args=(events, ahead), name="simulation", daemon=True
+        )
         producer.start()
         try:
             # The first events take the longest: start the clock when they are there.
             pending = self._next(ahead)
             start = StartTime(time.monotonic_ns(), time.time_ns(), self._rate)
+            for device in self._devices.values():
+                device.begin(start.monotonic_ns, self._rate)
             while pending is not None and not self._stop.is_set():
                 self._answer_until(start.monotonic(pending.ready_ns))
                 if not self._stop.is_set():
@@ -109,7 +122,8 @@ class DeviceServer:
     def close(self) -> None:
         """Unplug all devices."""
         for device in self._devices.values():
-            device.port.close()
+            if device.port.plugged:
+                device.port.close()
 
     def _deliver(self, event: Event, start: StartTime) -> None:
         lateness = time.monotonic_ns() - start.monotonic(event.ready_ns)
@@ -120,8 +134,7 @@ class DeviceServer:
             if self._on_truth is not None:
                 self._on_truth(event, start)
             return
-        device = self._device_of_event.get(type(event))
-        if device is not None:
+        for device in self._devices_of_event.get(type(event), ()):
             device.send(event, start.monotonic(event.time_ns), self._rate, self._array)
 
     def _produce(self, events: Iterator[Event], ahead: queue.Queue[Event | BaseException | None]) -> None:
@@ -134,7 +147,9 @@ class DeviceServer:
             last = error
         self._put(ahead, last)
 
-    def _put(self, ahead: queue.Queue[Event | BaseException | None], item: Event | BaseException | None) -> bool:
+    def _put(
+        self, ahead: queue.Queue[Event | BaseException | None], item: Event | BaseException | None
+    ) -> bool:
         while not (self._stop.is_set() or self._abandoned.is_set()):
             with contextlib.suppress(queue.Full):
                 ahead.put(item, timeout=0.1)
@@ -159,15 +174,20 @@ class DeviceServer:
             left = monotonic_ns - time.monotonic_ns()
             if left <= 0:
                 return
-            self._answer(min(left * 1e-9, 0.1))
+            self._answer(min(left * 1e-9, POLL))
 
     def _answer(self, timeout: float) -> None:
-        readable, _, _ = select.select([device.port for device in self._devices.values()], [], [], timeout)
+        now_ns = time.monotonic_ns()
         for device in self._devices.values():
+            device.advance(now_ns)
+        plugged = [device for device in self._devices.values() if device.port.plugged]
+        readable, _, _ = select.select([device.port for device in plugged], [], [], timeout)
+        for device in plugged:
             if device.port in readable:
                 device.answer(time.monotonic_ns)
 
     def _drain(self) -> None:
         deadline = time.monotonic() + DRAIN
-        while time.monotonic() < deadline and any(d.port.unread() for d in self._devices.values()):
+        listening = [device for device in self._devices.values() if device.port.plugged]
+        while time.monotonic() < deadline and any(d.port.unread() for d in listening):
             self._answer(0.01)

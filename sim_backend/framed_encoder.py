@@ -14,7 +14,7 @@ from cobs import cobs
 from numpy.typing import ArrayLike, NDArray
 
 VERSION = 1
-HALL, IMU, ENCODERS, ODOMETRY, HELLO, PONG = 0x01, 0x02, 0x03, 0x05, 0x70, 0x71
+HALL, IMU, ENCODERS, MOTORS, ODOMETRY, HELLO, PONG = 0x01, 0x02, 0x03, 0x04, 0x05, 0x70, 0x71
 PING, REZERO, IDENTIFY = 0xF0, 0xF1, 0xF2
 HALL_STEP_MT = 0.01
 _HEADER = struct.Struct("<BBHI")
@@ -53,6 +53,11 @@ class FramedEncoder:
         """Cumulative counts of the screws; they wrap modulo 2^32."""
         wrapped = (np.asarray(ticks, dtype=np.int64) & 0xFFFFFFFF).astype("<u4")
         return self._packet(ENCODERS, device_time_us, struct.pack("<B", len(wrapped)) + wrapped.tobytes())
+
+    def motors(self, device_time_us: int, motors: ArrayLike) -> bytes:
+        """Speed (rpm), current (mA) and voltage (V) of each screw, shape (n, 3)."""
+        values = np.asarray(motors).astype("<f4")
+        return self._packet(MOTORS, device_time_us, struct.pack("<B", len(values)) + values.tobytes())
 
     def odometry(self, device_time_us: int, velocity: ArrayLike) -> bytes:
         """Body velocity vx, vy, wz, m/s, m/s, rad/s."""

@@ -17,6 +17,7 @@ class PseudoTerminal:
     Attributes:
         path: the port's name, a symbolic link to the terminal.
         dropped: packets that nobody took.
+        plugged: whether the port exists; False once it is closed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -27,6 +28,7 @@ class PseudoTerminal:
         """
         self.path = path
         self.dropped = 0
+        self.plugged = True
         self._master, self._slave = pty.openpty()
         # This end keeps the host's end open too, or reading would fail whenever no host is there.
         tty.setraw(self._slave)
@@ -69,6 +71,7 @@ class PseudoTerminal:
 
     def close(self) -> None:
         """Unplug: the host's end fails from now on, and the name is gone."""
+        self.plugged = False
         self.path.unlink(missing_ok=True)
         os.close(self._master)
         os.close(self._slave)

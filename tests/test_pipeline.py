@@ -54,6 +54,13 @@ def test_a_robot_whose_screws_fall_silent_is_lost_and_says_so(model):
     assert states[4200] == "lost"
 
 
+def test_the_first_poses_are_known_even_before_the_first_odometry(model):
+    pipeline = pipeline_of(model, "")
+    states = [pipeline.add("whiskers", frame(ms, model))[0].state for ms in range(0, 3000, 40)]
+    assert states[0] == "tracking"
+    assert states[-1] == "lost"
+
+
 def test_without_slam_the_pose_in_map_is_the_odometry(model):
     results = feed(pipeline_of(model, "[slam]\nmethod = 'none'"), model, 1000, screws_until_ms=1000)
     assert len(results) == 25

@@ -112,7 +112,7 @@ def path(stamp_ns: int, frame: str, stamps_ns: Sequence[int], poses: FloatArray)
     """
     if len(poses) > MAX_PATH_POSES:
         kept = np.linspace(0, len(poses) - 1, MAX_PATH_POSES).round().astype(np.intp)
-        poses, stamps_ns = poses[kept], [stamps_ns[k] for k in kept]
+        poses, stamps_ns = poses[kept], [stamps_ns[int(k)] for k in kept]
     head = cdr.stamp(stamp_ns) + cdr.string(frame, 8)
     head += cdr.padding(len(head), 4) + cdr.UINT32.pack(len(poses))
     parts = [cdr.CDR_LITTLE_ENDIAN, head]

@@ -1,0 +1,54 @@
+"""The surface that tips lie on, as a function whose zero it is: fast enough to be asked for every frame."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_backend.world import World
+
+FloatArray = NDArray[np.float64]
+
+#: Node distance of the sampled surface, m: the edges of objects become ramps of this width, and on ground that
+#: curves by 1 mm over 20 mm the chords lie within 0.02 mm.
+SAMPLING = 0.005
+
+
+class Surface(Protocol):
+    """What a rod's end can touch: positive in the open, zero on the surface, negative inside."""
+
+    def gap(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Value at points of shape (3, n), m, shape (n,), and its gradient there, shape (3, n), not normalised."""
+
+
+class SampledHeight:
+    """Ground and objects of a world as one height field, bilinear between nodes 5 mm apart: z - height(x, y)."""
+
+    def __init__(self, world: World, cell: float = SAMPLING) -> None:
+        """Sample the world's surface over the extent of its ground; beyond, the edge's height goes on."""
+        (x0, x1), (y0, y1) = world.ground.extent
+        x, y = np.arange(x0, x1 + cell / 2, cell), np.arange(y0, y1 + cell / 2, cell)
+        z = world.height(*np.meshgrid(x, y))
+        self._start = np.array([[x0], [y0]])
+        self._cell = cell
+        self._last = np.array([[len(x) - 2 + 1 - 1e-9], [len(y) - 2 + 1 - 1e-9]])
+        self._width = len(x) - 1
+        dx, dy = np.diff(z, axis=1)[:-1], np.diff(z, axis=0)[:, :-1]
+        twist = z[1:, 1:] - z[1:, :-1] - dx
+        self._table = np.stack([z[:-1, :-1], dx, dy, twist], axis=-1).reshape(-1, 4)
+
+    def gap(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """See `Surface.gap`."""
+        place = (p[:2] - self._start) / self._cell
+        np.clip(place, 0.0, self._last, out=place)
+        whole = place.astype(np.intp)
+        place -= whole
+        u, v = place
+        z, dx, dy, twist = self._table.take(whole[1] * self._width + whole[0], axis=0).T
+        gradient = np.ones_like(p)
+        along_x = dx + twist * v
+        np.divide(along_x, -self._cell, out=gradient[0])
+        np.divide(dy + twist * u, -self._cell, out=gradient[1])
+        return p[2] - z - u * along_x - v * dy, gradient
