@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Protocol, get_args
 
@@ -249,6 +249,22 @@ def parse_protocol(device: str, text: str) -> tuple[str, str]:
     if variant and variant not in variants:
         raise ProtocolError(f"{name} has no variant {variant!r}; choose from {', '.join(variants) or 'none'}")
     return name, variant or (variants[0] if variants else "")
+
+
+def parse_protocols(options: Iterable[str]) -> dict[str, str]:
+    """Protocols by device from texts such as `whiskers=rm3-compressed:cartesian`.
+
+    Raises:
+        ProtocolError: a text is no such pair, or the device does not speak the protocol.
+    """
+    chosen = {}
+    for option in options:
+        device, equals, protocol = option.partition("=")
+        if not equals:
+            raise ProtocolError(f"{option!r}: expected DEVICE=PROTOCOL, such as whiskers=rm3-compressed")
+        parse_protocol(device, protocol)
+        chosen[device] = protocol
+    return chosen
 
 
 def firmware(name: str, protocol: str, variant: str, screw: str | None = None) -> Firmware:

@@ -90,7 +90,7 @@ class DeviceServer:
         deadline = time.monotonic() + timeout
         while not self._stop.is_set() and time.monotonic() < deadline:
             self._answer(0.05)
-            if all([device.host_came for device in awaited]):
+            if all(device.host_came for device in awaited):
                 self._answer_until(time.monotonic_ns() + int(1e9 * CLOCK_LEARNING))
                 return True
         return False
@@ -135,6 +135,7 @@ class DeviceServer:
                 self._on_truth(event, start)
             return
         for device in self._devices_of_event.get(type(event), ()):
+            device.advance(time.monotonic_ns())
             device.send(event, start.monotonic(event.time_ns), self._rate, self._array)
 
     def _produce(self, events: Iterator[Event], ahead: queue.Queue[Event | BaseException | None]) -> None:

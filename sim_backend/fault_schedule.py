@@ -169,8 +169,25 @@ def random_faults(
             case "device":
                 target = devices[int(rng.integers(len(devices)))]
         end = start + (lasts if math.isinf(kind.length) else kind.length)
-        drawn.append(Fault(name, start, end, target, dict(kind.parameters)))
+        parameters = dict(kind.parameters)
+        if name == "unplugged" and rng.random() < 0.5:
+            parameters["name"] = f"{target}-again"
+        drawn.append(Fault(name, start, end, target, parameters))
     return _ordered(drawn)
+
+
+def faults_from_option(text: str, duration: float, *, rows: int = 8, cols: int = 8) -> FaultSchedule:
+    """The schedule that a command line names: a file, or `seed:N`; arguments as of `random_faults`.
+
+    Raises:
+        FaultFileError: no such schedule.
+    """
+    if not text.startswith("seed:"):
+        return load_faults(Path(text))
+    number = text.removeprefix("seed:")
+    if not number.isdecimal():
+        raise FaultFileError(f"{text!r}: expected a file or seed:N with a whole number N")
+    return random_faults(int(number), duration, rows=rows, cols=cols)
 
 
 def _ordered(faults: Iterable[Fault]) -> FaultSchedule:
@@ -182,7 +199,7 @@ def _parsed(table: object, where: str) -> Fault:
         raise FaultFileError(f"{where}: expected a table")
     rest = dict(table)
     name = rest.pop("kind", None)
-    if name not in KINDS:
+    if not isinstance(name, str) or name not in KINDS:
         raise FaultFileError(f"{where}: kind is {name!r}, expected one of {', '.join(KINDS)}")
     kind, where = KINDS[name], f"{where} ({name})"
     target = _target(kind.target, rest, where)

@@ -34,8 +34,8 @@ def damaged(
 class FaultyLine:
     """A pseudo-terminal behind a bad cable; the same calls as a `PseudoTerminal`.
 
-    Until `advance` is called for the first time the line is good. A stall holds back what the device sends, not what the
-    host sends, so that answers to a PING in it come late with an early time.
+    Until `advance` is called for the first time the line is good. A stall holds back what the device sends, not
+    what the host sends, so that answers to a PING in it come late with an early time.
 
     Attributes:
         dropped: packets that nobody took, and those sent while the device was unplugged or the link was full.
@@ -114,8 +114,8 @@ class FaultyLine:
             return True
         if self._held and not self._stalled():
             held, self._held, self._held_bytes = self._held, [], 0
-            for packet in held:
-                self._port.write(packet)
+            if not self._port.write(b"".join(held)):
+                self._lost_packets += len(held) - 1  # the port has counted one
         return False
 
     def fileno(self) -> int:

@@ -30,8 +30,6 @@ BoolArray = NDArray[np.bool_]
 
 #: Frames computed at once where one does not depend on the other.
 BLOCK = 50
-#: Projections onto sphere and surface per frame; tips move 6 mm a frame and two leave less than 0.1 mm.
-PROJECTIONS = 2
 #: Longest move of a projection, m: beyond, the surface is not what its slope promised.
 LONGEST_MOVE = 0.03
 #: What a projection may leave, m, before the tip is laid down anew.
@@ -84,6 +82,7 @@ class QuasiStaticEngine:
         self._touching = np.zeros(n, dtype=np.bool_)
         self._tip = self._mount = self._gradient = np.full((3, n), np.nan)
         self._gap = np.full(n, np.nan)
+        self._frame_is_even = False
         self._side = np.zeros((3, n))  # move to the side that the balance asks for in the next frame
         self._next = -round(settle_time / frame_interval)
         self._ready: list[ArrayReading] = []
@@ -163,26 +162,23 @@ class QuasiStaticEngine:
             blocked: whether the surface is in the way of hanging, shape (n,).
         """
         before, tip = self._tip, self._tip + self._side
-        gap, G = self._gap + _dot(self._gradient, self._side), self._gradient
-        for _ in range(PROJECTIONS):
-            tip = self._project(tip, mount, gap, G)
-            gap, G = self._surface.gap(tip)
-        d = (tip - mount) / self._reach
+        gap, G = self._gap + np.add.reduce(self._gradient * self._side), self._gradient
+        tip = self._project(tip, mount, gap, G)
+        gap, G = self._surface.gap(tip)
         steep = np.sqrt(_dot(G, G))
-        n = G / steep
-        force = self._force(d, R)
-        nd = _dot(n, d)
-        press = _dot(force, n) - _dot(force, d) * nd  # below zero, the spring pushes the tip into the surface
-        off = np.abs(gap / steep - self._radius) > TOLERANCE
-        blocked_or_held = self._touching & (press < 0.0)
-        touching: BoolArray = blocked_or_held & ~off
-        fresh = ~touching & (blocked | (blocked_or_held & off))
-        self._slip(tip - before, d, n, nd, force, press, touching)
-        if not touching.all():
+        off = np.abs(gap - self._radius * steep) > TOLERANCE * steep
+        held = self._touching
+        self._frame_is_even = not self._frame_is_even
+        if self._frame_is_even:
+            held = held & self._balance(tip - before, (tip - mount) / self._reach, G / steep, R)
+        touching: BoolArray = held & ~off
+        if np.count_nonzero(touching) < len(touching):
+            fresh = ~touching & (blocked | held)
             tip = np.where(touching | fresh, tip, hanging)
             who = np.flatnonzero(fresh)
             if len(who):
                 touching[who] = self._lay_down(who, mount, (hanging[:, who] - mount[:, who]) / self._reach[who], tip)
+            self._side = self._side * (held & ~off)
             gap, G = self._surface.gap(tip)
         self._tip, self._touching, self._mount, self._gap, self._gradient = tip, touching, mount, gap, G
 
@@ -219,39 +215,35 @@ class QuasiStaticEngine:
         force[2] -= self._sag
         return force
 
-    def _slip(
-        self,
-        moved: FloatArray,
-        d: FloatArray,
-        n: FloatArray,
-        nd: FloatArray,
-        force: FloatArray,
-        press: FloatArray,
-        sliding: BoolArray,
-    ) -> None:
-        """How far the balance of forces along the curve moves each tip in the next frame (module's docstring).
+    def _balance(self, moved: FloatArray, d: FloatArray, n: FloatArray, R: FloatArray) -> BoolArray:
+        """Find how far the forces along the curve move each tip per frame (module's docstring).
 
         Args:
             moved: of the tip in this frame, shape (3, n), m.
             d, n: directions of rod and surface's normal, shape (3, n).
-            nd: n.d, shape (n,).
-            force: of the springs, shape (3, n).
-            press: q F.e, shape (n,).
-            sliding: which tips have slid on the surface.
+            R: rotations, whisker frame to map, shape (n, 3, 3).
+
+        Returns:
+            Whether the spring presses the tip onto the surface, shape (n,).
         """
+        force, nd = self._force(d, R), _dot(n, d)
+        press = _dot(force, n) - _dot(force, d) * nd  # q F.e
         t = np.empty_like(d)
         t[0] = d[1] * n[2] - d[2] * n[1]
         t[1] = d[2] * n[0] - d[0] * n[2]
         t[2] = d[0] * n[1] - d[1] * n[0]
         q2 = np.maximum(1.0 - nd * nd, 1e-4)
+        q = np.sqrt(q2)
         outward = _dot(moved, d) - nd * _dot(moved, n)  # times q
-        resisting = np.maximum(np.sqrt(q2) + self._friction * np.sign(outward) * nd, 0.05)
+        resisting = np.maximum(q + self._friction * np.sign(outward) * nd, 0.05)
         share = _dot(force, t) * resisting / (-self._friction * np.minimum(press, -1e-6))
         within = np.minimum(np.maximum(share, -0.95), 0.95)
         far = np.abs(outward) * within / np.sqrt((1.0 - within * within) * q2)
         far += LONGEST_SLIP * (share - np.minimum(np.maximum(share, -1.0), 1.0))
-        t *= np.minimum(np.maximum(far, -LONGEST_SLIP), LONGEST_SLIP) * sliding / np.sqrt(q2)
+        t *= np.minimum(np.maximum(far, -LONGEST_SLIP), LONGEST_SLIP) / q
         self._side = t
+        pressed: BoolArray = press < 0.0
+        return pressed
 
     def _lay_down(self, who: NDArray[np.intp], mount: FloatArray, z: FloatArray, tip: FloatArray) -> BoolArray:
         """Let rods that have lost the surface, or meet it, fall from lying to the first touch, trailing.
@@ -270,25 +262,19 @@ class QuasiStaticEngine:
         lay[0] -= 1e-9
         lay -= _dot(lay, z) * z
         lay /= np.maximum(np.sqrt(_dot(lay, lay)), 1e-12)
-        reach, at = self._reach[who], mount[:, None, who]
-
-        def place(angle: FloatArray) -> FloatArray:
-            p: FloatArray = at + reach * (np.cos(angle) * z[:, None, :] + np.sin(angle) * lay[:, None, :])
-            return p
-
-        def inside(angle: FloatArray) -> BoolArray:
-            value, G = self._surface.gap(place(angle).reshape(3, -1))
-            return (value < self._radius * np.sqrt(_dot(G, G))).reshape(angle.shape)
-
-        fallen = inside(np.broadcast_to(FALL[:, None], (len(FALL), len(who))))
+        reach = self._reach[who]
+        angle = FALL[:, None]
+        p = mount[:, None, who] + reach * (np.cos(angle) * z[:, None, :] + np.sin(angle) * lay[:, None, :])
+        value, G = self._surface.gap(p.reshape(3, -1))
+        above = value.reshape(p.shape[1:]) - self._radius * np.sqrt(_dot(G, G)).reshape(p.shape[1:])
+        fallen = above < 0.0
         touched: BoolArray = fallen.any(axis=0)
-        first = np.maximum(fallen.argmax(axis=0), 1)
-        low, high = FALL[None, first], FALL[None, first - 1]
-        for _ in range(8):
-            middle = 0.5 * (low + high)
-            below = inside(middle)
-            low, high = np.where(below, middle, low), np.where(below, high, middle)
-        tip[:, who] = place(np.where(touched, high, 0.0))[:, 0]
+        first, each = np.maximum(fallen.argmax(axis=0), 1), np.arange(len(who))
+        before, after = np.maximum(above[first - 1, each], 0.0), above[first, each]
+        share = np.where(touched, before / np.maximum(before - after, 1e-9), 0.0)
+        tip[:, who] = np.where(
+            touched, p[:, first - 1, each] + share * (p[:, first, each] - p[:, first - 1, each]), p[:, -1, each]
+        )
         return touched
 
 

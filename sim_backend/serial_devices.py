@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sim_backend.device_protocols import Firmware, Seen, firmware, parse_protocol
 from sim_backend.events import EncoderEvent, Event, ImuEvent, OdometryEvent, WhiskerEvent
-from sim_backend.fault_schedule import SCREWS, FaultSchedule
+from sim_backend.fault_schedule import KINDS, SCREWS, FaultFileError, FaultSchedule
 from sim_backend.line_faults import FaultyClock, FaultyLine
 from sim_backend.pseudo_terminal import PseudoTerminal
 from sim_backend.random_streams import stream
@@ -79,7 +79,6 @@ class SerialDevice:
         self.name, self.port, self.role = name, port, role or name
         self.protocol, self._variant = parse_protocol(self.role, protocol)
         self.sent = 0
-        self._heard = False
         if isinstance(clock, ClockSettings):
             clock = FaultyClock(clock.offset_us, clock.drift_ppm, now_ns)
         self._clock = clock
@@ -105,14 +104,12 @@ class SerialDevice:
 
     @property
     def host_came(self) -> bool:
-        """Whether a host wants this device's data.
+        """Whether a host wants this device's data; meaningful before the first measurement.
 
         It has asked for the time or sent a command. A device that never listens takes it from its greeting, which
         stays in the port until somebody opens it and reads or flushes it.
         """
-        if self._firmware.one_way and self.port.unread() == 0:
-            self._heard = True
-        return self._heard or self._firmware.asked
+        return self._firmware.asked or (self._firmware.one_way and self.port.unread() == 0)
 
     def settings(self) -> dict[str, str | int]:
         """The device's keys in the daemon's configuration (interfaces, section 5) that follow from the protocol."""
@@ -203,19 +200,29 @@ def plug_in(
 
     Raises:
         ProtocolError: a device does not speak its protocol, or there is no such device.
+        FaultFileError: a fault befalls a device that is not there.
         OSError: a port cannot be made.
     """
     chosen = DEFAULT_CLOCKS | dict(clocks or {})
     spoken = dict.fromkeys(names, "framed") | dict(protocols or {})
-    # All at once, before there is any port.
-    parsed = {role: parse_protocol(role, text)[0] for role, text in spoken.items()}
+    boards = {role: _boards(role, parse_protocol(role, text)[0]) for role, text in spoken.items()}
+    known = set(boards) | {board for several in boards.values() for board in several}
+    for fault in faults.faults if faults is not None else ():
+        if KINDS[fault.kind].target == "device" and fault.target not in known:
+            there = ", ".join(sorted(known))
+            raise FaultFileError(
+                f"{fault.kind} at {fault.start:g} s: no device {fault.target!r}; there are {there}"
+            )
     devices: dict[str, SerialDevice] = {}
     for role in names:
-        boards = [f"screw_{screw}" for screw in SCREWS] if parsed[role] == "rm3-motor" else [role]
-        for name in boards:
+        for name in boards[role]:
             bad = faults.of_device(name, role) if faults is not None else ()
             path = folder / name
             port = FaultyLine(path, bad, stream(seed, f"line {name}")) if bad else PseudoTerminal(path)
             clock = FaultyClock(chosen[role].offset_us, chosen[role].drift_ppm, now_ns, bad)
             devices[name] = SerialDevice(name, port, clock, now_ns, role=role, protocol=spoken[role])
     return devices
+
+
+def _boards(role: str, protocol: str) -> list[str]:
+    return [f"screw_{screw}" for screw in SCREWS] if protocol == "rm3-motor" else [role]

@@ -32,7 +32,7 @@ class SampledHeight:
         x, y = np.arange(x0, x1 + cell / 2, cell), np.arange(y0, y1 + cell / 2, cell)
         z = world.height(*np.meshgrid(x, y))
         self._start = np.array([[x0], [y0]])
-        self._cell = cell
+        self._scale = 1.0 / cell
         self._last = np.array([[len(x) - 2 + 1 - 1e-9], [len(y) - 2 + 1 - 1e-9]])
         self._width = len(x) - 1
         dx, dy = np.diff(z, axis=1)[:-1], np.diff(z, axis=0)[:, :-1]
@@ -41,14 +41,19 @@ class SampledHeight:
 
     def gap(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
         """See `Surface.gap`."""
-        place = (p[:2] - self._start) / self._cell
-        np.clip(place, 0.0, self._last, out=place)
+        place = (p[:2] - self._start) * self._scale
+        np.minimum(np.maximum(place, 0.0, out=place), self._last, out=place)
         whole = place.astype(np.intp)
         place -= whole
         u, v = place
-        z, dx, dy, twist = self._table.take(whole[1] * self._width + whole[0], axis=0).T
-        gradient = np.ones_like(p)
-        along_x = dx + twist * v
-        np.divide(along_x, -self._cell, out=gradient[0])
-        np.divide(dy + twist * u, -self._cell, out=gradient[1])
-        return p[2] - z - u * along_x - v * dy, gradient
+        patch = self._table.take(whole[1] * self._width + whole[0], axis=0).T
+        z, _, dy, twist = patch
+        gradient = np.empty_like(p)
+        gradient[2] = 1.0
+        slope = gradient[:2]
+        np.multiply(twist, place[::-1], out=slope)
+        slope += patch[1:3]
+        height = z + u * slope[0]
+        height += v * dy
+        slope *= -self._scale
+        return p[2] - height, gradient

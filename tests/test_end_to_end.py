@@ -108,6 +108,8 @@ class Drive:
     log: str
     commands: dict[str, dict]
     bad_query: str
+    updates: list[bytes]
+    new_graph: dict
 
 
 @pytest.fixture(scope="module")
@@ -147,6 +149,10 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
                 while not heard.status.empty():
                     heard.status.get()
                 last_status = heard.status.get(timeout=5)
+                updates = list(heard.updates)
+                assert json.loads(bus.get("cmd/new_map", {"id": "4"})[0].payload)["ok"]
+                assert json.loads(bus.get("cmd/new_map", {"id": "4"})[0].payload)["ok"]
+                new_graph = json.loads(ask(bus, "map/graph"))
                 with pytest.raises(QueryError) as bad_query:
                     bus.get("map/nothing", timeout_s=1.0)
             daemon.send_signal(signal.SIGTERM)
@@ -158,7 +164,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
                     process.wait()
     return Drive(
         heard, read_tum(Path(ready["truth"])), graph, int(cloud.width), snapshot, last_status, folder, exit_code,
-        (folder / "run.log").read_text(), commands, str(bad_query.value),
+        (folder / "run.log").read_text(), commands, str(bad_query.value), updates, new_graph,
     )  # fmt: skip
 
 
@@ -202,7 +208,7 @@ def test_the_map_stream_and_the_snapshot_lead_to_the_robots_map(drive: Drive):
     from_snapshot, from_updates = MapStreamDecoder(), MapStreamDecoder()
     for message in drive.snapshot:
         from_snapshot.feed(message)
-    for message in drive.heard.updates:
+    for message in drive.updates:
         from_updates.feed(message)
     digest = drive.last_status["localization"]["map.digest"]
     assert from_snapshot.state is not None
@@ -230,6 +236,11 @@ def test_commands_are_answered(drive: Drive):
     assert "no answer" in drive.bad_query
 
 
+def test_a_new_map_is_empty_and_a_repeated_command_does_nothing_twice(drive: Drive):
+    assert drive.new_graph["keyframes"] == []
+    assert drive.new_graph["version"] > drive.graph["version"]
+
+
 def test_the_daemon_ends_cleanly_and_the_keyframes_are_in_the_database(drive: Drive):
     assert drive.exit_code == 0, drive.log
     assert "Traceback" not in drive.log
@@ -240,7 +251,8 @@ def test_the_daemon_ends_cleanly_and_the_keyframes_are_in_the_database(drive: Dr
     finally:
         connection.close()
     assert stored >= len(drive.graph["keyframes"])
-    assert names == [("test",)]
+    # The map that was saved, and the one that new_map began (once, though the command came twice).
+    assert names == [("test",), ("",)]
 
 
 def test_the_demo_without_slam_gives_exactly_the_odometry(tmp_path: Path):
