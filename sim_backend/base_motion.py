@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -107,3 +108,80 @@ class LevelGrid:
         omega[:, 2], alpha[:, 2] = motion.velocity[:, 2], motion.acceleration[:, 2]
         R = Rotation.from_rotvec(motion.pose * [0.0, 0.0, 1.0]).as_matrix()
         return BaseStates(position, R, velocity, acceleration, omega, alpha)
+
+
+class FollowGround:
+    """A body on the ground: its height, pitch and roll are those of the plane fitted to the ground under it.
+
+    Heading and way are the path's. Where the ground is level at the start, base_link starts as the map's origin.
+    """
+
+    #: Places under the body that carry it, m: half the length and half the width of the screws' footprint.
+    FOOTPRINT = (0.30, 0.25)
+    #: Half the step of the differences that give velocity and acceleration, s.
+    STEP = 0.005
+
+    def __init__(
+        self,
+        path: WaypointPath,
+        floor: Callable[[FloatArray, FloatArray], FloatArray],
+        ride_height: float,
+        touch_down: TouchDown | None = None,
+    ) -> None:
+        """Drive the path on a floor.
+
+        Args:
+            path: way and heading.
+            floor: height of the floor at places x, y of equal shape, m.
+            ride_height: of base_link's origin above the fitted plane, m; below it where negative.
+            touch_down: before time 0.
+        """
+        self.path, self.floor, self.ride_height = path, floor, ride_height
+        self._level = LevelGrid(path, touch_down or TouchDown(height=0.06))
+        along, across = np.meshgrid(np.linspace(-1, 1, 3), np.linspace(-1, 1, 3))
+        self._feet = np.stack([along.ravel() * self.FOOTPRINT[0], across.ravel() * self.FOOTPRINT[1]])
+        #: Least squares: rows give height, slope along and slope across from the heights under the feet.
+        self._fit = np.linalg.pinv(np.column_stack([np.ones(9), *self._feet]))
+
+    @property
+    def duration(self) -> float:
+        """When the path has been driven, s."""
+        return self.path.duration
+
+    @property
+    def length(self) -> float:
+        """Length of the path, m."""
+        return self.path.length
+
+    def at(self, time: ArrayLike) -> BaseStates:
+        """The body's motion at times of shape (n,), s."""
+        t = np.atleast_1d(np.asarray(time, dtype=np.float64))
+        n, h = len(t), self.STEP
+        position, R = self._pose(np.concatenate([t - h, t, t + h]))
+        p, R = position.reshape(3, n, 3), R.reshape(3, n, 3, 3)
+        ahead = Rotation.from_matrix(R[2] @ R[1].swapaxes(-1, -2)).as_rotvec()
+        behind = Rotation.from_matrix(R[1] @ R[0].swapaxes(-1, -2)).as_rotvec()
+        return BaseStates(
+            p[1],
+            R[1],
+            (p[2] - p[0]) / (2.0 * h),
+            (p[2] - 2.0 * p[1] + p[0]) / h**2,
+            (ahead + behind) / (2.0 * h),
+            (ahead - behind) / h**2,
+        )
+
+    def _pose(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Positions, shape (n, 3), m, and rotations, shape (n, 3, 3)."""
+        level = self._level.at(t)
+        forward, left = level.R[:, :2, 0], level.R[:, :2, 1]
+        feet = level.position[:, :2, None] + forward[:, :, None] * self._feet[0] + left[:, :, None] * self._feet[1]
+        height, along, across = self._fit @ self.floor(feet[:, 0], feet[:, 1]).T
+        up = np.stack([np.zeros_like(along), np.zeros_like(along), np.ones_like(along)], axis=-1)
+        up[:, :2] = -along[:, None] * forward - across[:, None] * left
+        up /= np.sqrt(np.square(up).sum(axis=-1, keepdims=True))
+        ahead = np.column_stack([forward, along])
+        ahead /= np.sqrt(np.square(ahead).sum(axis=-1, keepdims=True))
+        R = np.stack([ahead, np.cross(up, ahead), up], axis=-1)
+        position = level.position.copy()
+        position[:, 2] += height + self.ride_height
+        return position, R

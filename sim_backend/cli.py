@@ -24,10 +24,16 @@ A recording instead, as fast as it goes; the same with another odometry; and ser
 
 
 @click.command(epilog=EPILOG)
-@click.option("--world", default="thesis", show_default=True, help="World to drive in: thesis.")
+@click.option(
+    "--world", default="thesis", show_default=True, help="World to drive in: thesis, random:SEED, flat or corridor."
+)
 @click.option("--scenario", default=1, show_default=True, help="Scenario of the world, 1 to 5.")
 @click.option(
-    "--engine", type=click.Choice(["physics"]), default="physics", show_default=True, help="What moves the whiskers."
+    "--engine",
+    type=click.Choice(["physics", "quasi-static"]),
+    default="physics",
+    show_default=True,
+    help="What moves the whiskers: MuJoCo, or geometry alone, which is many times faster.",
 )
 @click.option("--seed", default=1, show_default=True, help="Tolerances, biases, noise and slip of all sensors.")
 @click.option("--odometry-seed", type=int, help="Bias and noise of the ready-made odometry.  [default: 0]")
@@ -71,6 +77,13 @@ A recording instead, as fast as it goes; the same with another odometry; and ser
 )
 @click.option("--method", default=None, help="SLAM method in the configuration (default: the daemon's).")
 @click.option("--listen", default="tcp/127.0.0.1:7447", show_default=True, help="Zenoh endpoint in the configuration.")
+@click.option(
+    "--protocol",
+    "protocols",
+    multiple=True,
+    help="What a device speaks, as whiskers=rm3-compressed; framed by default; repeat for several.",
+)
+@click.option("--faults", help="What goes wrong: a TOML file of [[fault]] tables, or seed:N.")
 @click.option("--max-time", type=click.FloatRange(min=0.1), default=None, help="Cut the drive short, s.")
 @click.option(
     "--wait",
@@ -102,6 +115,8 @@ def simulate(
     source: str,
     method: str | None,
     listen: str,
+    protocols: tuple[str, ...],
+    faults: str | None,
     max_time: float | None,
     wait: float,
     recording: Path | None,
@@ -116,6 +131,8 @@ def simulate(
     from sim_backend import imu as imus
     from sim_backend import odometry as odometries
     from sim_backend import simulate as simulation
+    from sim_backend.device_protocols import ProtocolError
+    from sim_backend.fault_schedule import FaultFileError
     from sim_backend.recorded_drive import RecordedDriveError, with_other_odometry
     from sim_backend.robot import RobotSettings
     from sim_backend.world import WorldError
@@ -138,6 +155,8 @@ def simulate(
         source=source,
         method=method,
         listen=listen,
+        protocols=protocols,
+        faults=faults,
     )
 
     def ready(report: simulation.ReadyReport) -> None:
@@ -174,7 +193,7 @@ def simulate(
         else:
             drive = simulation.simulated_drive(settings)
         report = simulation.serve(settings, drive, ready)
-    except (WorldError, RecordedDriveError, OSError) as error:
+    except (WorldError, RecordedDriveError, ProtocolError, FaultFileError, OSError) as error:
         raise click.UsageError(str(error)) from error
     if as_json:
         _print_json({"event": "done", **asdict(report)})

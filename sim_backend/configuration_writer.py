@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import tomlkit
@@ -18,8 +19,18 @@ BAUD = 115200
 CALIBRATION_DATE = "2021-06-01"
 
 
+@dataclass(frozen=True, slots=True)
+class Port:
+    """A simulated device: what it measures (whiskers, imu, screws, odometry), its port, protocol and own name."""
+
+    role: str
+    path: Path
+    protocol: str = "framed"
+    name: str = ""
+
+
 def configuration_text(
-    ports: Mapping[str, Path],
+    ports: Sequence[Port],
     layout: str,
     *,
     ticks_per_turn: int,
@@ -33,7 +44,7 @@ def configuration_text(
     """A configuration for the daemon (interfaces, section 5).
 
     Args:
-        ports: device name (whiskers, imu, screws, odometry) to port; one that the source does not use is left out.
+        ports: of the devices; one that the source does not use is left out.
         layout: of the array: a built-in name or a file.
         ticks_per_turn: of the screws' encoders.
         mount_rpy_deg: of the IMU.
@@ -47,11 +58,12 @@ def configuration_text(
     document.add(tomlkit.comment("Written by `robominer-slam simulate` for the simulated robot."))
     document["robot"] = {"id": robot_id, "layout": layout, "role": "all"}
     devices = tomlkit.aot()
-    for name, port in ports.items():
+    for port in ports:
+        name = port.role
         if name not in USED_BY_SOURCE[source]:
             continue
         device = tomlkit.table()
-        device.update({"name": name, "port": str(port), "protocol": "framed", "baud": BAUD})
+        device.update({"name": port.name or name, "port": str(port.path), "protocol": port.protocol, "baud": BAUD})
         if name == "whiskers":
             device["calibration"] = CALIBRATION
         if name == "screws":

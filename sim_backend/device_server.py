@@ -90,7 +90,7 @@ class DeviceServer:
         deadline = time.monotonic() + timeout
         while not self._stop.is_set() and time.monotonic() < deadline:
             self._answer(0.05)
-            if all(device.host_came for device in awaited):
+            if all(device.host_came(time.monotonic_ns()) for device in awaited):
                 self._answer_until(time.monotonic_ns() + int(1e9 * CLOCK_LEARNING))
                 return True
         return False

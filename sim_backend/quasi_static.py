@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from robominer_slam.layout import WhiskerLayout
 from sim_backend.base_motion import BaseMotion
 from sim_backend.physics import ArrayReading
-from sim_backend.whisker_model import WhiskerMechanics
 from sim_backend.touch_surface import Surface
+from sim_backend.whisker_model import WhiskerMechanics
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -268,7 +268,7 @@ class QuasiStaticEngine:
         value, G = self._surface.gap(p.reshape(3, -1))
         above = value.reshape(p.shape[1:]) - self._radius * np.sqrt(_dot(G, G)).reshape(p.shape[1:])
         fallen = above < 0.0
-        touched: BoolArray = fallen.any(axis=0)
+        touched: BoolArray = np.logical_or.reduce(fallen)
         first, each = np.maximum(fallen.argmax(axis=0), 1), np.arange(len(who))
         before, after = np.maximum(above[first - 1, each], 0.0), above[first, each]
         share = np.where(touched, before / np.maximum(before - after, 1e-9), 0.0)

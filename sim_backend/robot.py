@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +12,14 @@ from scipy.spatial.transform import Rotation
 from robominer_slam import layout as layouts
 from robominer_slam.layout import WhiskerLayout
 from sim_backend import world as worlds
-from sim_backend.base_motion import BaseMotion, LevelGrid
+from sim_backend.base_motion import BaseMotion
+from sim_backend.engines import ENGINES, base_motion_on, build_engine
 from sim_backend.events import EncoderEvent, Event, ImuEvent, OdometryEvent, TruthEvent, WhiskerEvent
 from sim_backend.hall_drift import DriftSettings, HallDrift
 from sim_backend.imu import Imu, ImuSettings
 from sim_backend.magnet import HallArray
 from sim_backend.odometry import BiasedOdometry, OdometrySettings, mean_body_velocity
-from sim_backend.physics import Engine, PhysicsEngine
+from sim_backend.physics import Engine
 from sim_backend.random_streams import stream
 from sim_backend.screws import ScrewEncoders, ScrewSettings
 from sim_backend.waypoints import DriveSettings, WaypointPath
@@ -26,7 +27,6 @@ from sim_backend.world import World
 
 FloatArray = NDArray[np.float64]
 NANOSECONDS = 1_000_000_000
-ENGINES = ("physics",)
 #: Frames for which the other sensors are computed at once: numpy is slow on few samples.
 BLOCK = 25
 
@@ -176,20 +176,24 @@ def build_robot(
     """The thesis's robot in a world, about to drive a scenario.
 
     Raises:
-        WorldError: no such world or scenario.
+        WorldError: no such world or scenario, or the engine cannot do this world.
         ValueError: no such engine.
     """
     if engine not in ENGINES:
         raise ValueError(f"no engine is called {engine!r}, expected one of {', '.join(ENGINES)}")
     chosen = settings or RobotSettings()
     world = worlds.load(world_name)
-    layout = layouts.thesis_grid()
-    motion = LevelGrid(WaypointPath(world.scenario(scenario), chosen.drive))
-    physics = PhysicsEngine(
+    layout = layouts.BUILT_IN[world.layout]()
+    # More whiskers are read faster, so that a frame ends before the next.
+    period = min(chosen.sensor_period_us, chosen.frame_interval_us * 96 // 100 // layout.count)
+    chosen = replace(chosen, sensor_period_us=period)
+    motion = base_motion_on(world, WaypointPath(world.scenario(scenario), chosen.drive))
+    array = build_engine(
+        engine,
         world,
         layout,
         motion,
         read_offset=np.arange(layout.count, dtype=np.float64) * chosen.sensor_period_us * 1e-6,
-        frame_interval=chosen.frame_interval_us * 1e-6,
+        interval=chosen.frame_interval_us * 1e-6,
     )
-    return SimulatedRobot(world, layout, motion, physics, chosen)
+    return SimulatedRobot(world, layout, motion, array, chosen)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from sim_backend.events import EncoderEvent, Event, ImuEvent, WhiskerEvent
-from sim_backend.fault_schedule import KINDS, SCREWS, Fault
+from sim_backend.fault_schedule import KINDS, SCREWS, Fault, FaultFileError
 from sim_backend.random_streams import stream
 
 FloatArray = NDArray[np.float64]
@@ -45,7 +45,7 @@ class SensorFaults:
             seed: of the faults' noise.
 
         Raises:
-            ValueError: a fault names a whisker outside the array.
+            FaultFileError: a fault names a whisker outside the array.
         """
         chosen = [fault for fault in faults if KINDS[fault.kind].target != "device"]
         self._whiskers: list[tuple[Fault, int]] = []
@@ -54,7 +54,7 @@ class SensorFaults:
                 row, col = fault.target
                 if col >= cols or row * cols + col >= len(rest_field_mT):
                     shape = f"{len(rest_field_mT) // cols} x {cols}"
-                    raise ValueError(f"{fault.kind} at row {row}, column {col}: the array is {shape}")
+                    raise FaultFileError(f"{fault.kind} at row {row}, column {col}: the array is {shape}")
                 self._whiskers.append((fault, row * cols + col))
         self._slips = [(f, SCREWS.index(f.target)) for f in chosen if isinstance(f.target, str)]
         self._silences = [fault for fault in chosen if fault.kind == "imu_silent"]

@@ -24,6 +24,8 @@ EVENT_OF_DEVICE: dict[str, type[Event]] = {
     "odometry": OdometryEvent,
 }
 BAUD = 115200
+#: What is written to a pseudo-terminal can be seen on its other side after this time, ns, also on a busy machine.
+GREETING_NS = 100_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,14 +104,14 @@ class SerialDevice:
         """REZERO commands received since power-up."""
         return self._firmware.rezeros
 
-    @property
-    def host_came(self) -> bool:
+    def host_came(self, now_ns: int) -> bool:
         """Whether a host wants this device's data; meaningful before the first measurement.
 
         It has asked for the time or sent a command. A device that never listens takes it from its greeting, which
         stays in the port until somebody opens it and reads or flushes it.
         """
-        return self._firmware.asked or (self._firmware.one_way and self.port.unread() == 0)
+        taken = now_ns - self._powered_ns > GREETING_NS and self.port.unread() == 0
+        return self._firmware.asked or (self._firmware.one_way and taken)
 
     def settings(self) -> dict[str, str | int]:
         """The device's keys in the daemon's configuration (interfaces, section 5) that follow from the protocol."""
@@ -168,6 +170,7 @@ class SerialDevice:
             self.sent += self.port.write(packet)
 
     def _power_up(self, now_ns: int) -> Firmware:
+        self._powered_ns = now_ns
         switched_on = firmware(self.name, self.protocol, self._variant, self.screw)
         greeting = switched_on.greeting(self._clock.microseconds(now_ns))
         if greeting:

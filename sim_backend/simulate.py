@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,15 +20,19 @@ from sim_backend.configuration_writer import (
     CALIBRATION,
     CONFIGURATION,
     USED_BY_SOURCE,
+    Port,
     configuration_text,
     write_calibration,
 )
+from sim_backend.device_protocols import parse_protocols
 from sim_backend.device_server import DeviceServer, StartTime
 from sim_backend.events import Event, TruthEvent
+from sim_backend.fault_schedule import FaultSchedule, faults_from_option
 from sim_backend.recorded_drive import RecordedDriveError, events_of
 from sim_backend.recorder import record
 from sim_backend.robot import RobotSettings, SimulatedRobot, build_robot
-from sim_backend.serial_devices import EVENT_OF_DEVICE, ClockSettings, plug_in
+from sim_backend.sensor_faults import SensorFaults
+from sim_backend.serial_devices import EVENT_OF_DEVICE, ClockSettings, SerialDevice, plug_in
 from sim_backend.truth import TruthFile
 
 TRUTH = "ground_truth.txt"
@@ -51,6 +55,8 @@ class SimulationSettings:
         method: of SLAM in the written configuration; None for the daemon's default.
         listen: Zenoh endpoint in the written configuration.
         clocks: clocks of devices that differ from the default.
+        protocols: of devices that speak another than `framed`, as `whiskers=rm3-compressed`.
+        faults: a file of faults, or `seed:N`; None for a robot without.
     """
 
     out: Path
@@ -64,6 +70,8 @@ class SimulationSettings:
     method: str | None = None
     listen: str = "tcp/127.0.0.1:7447"
     clocks: dict[str, ClockSettings] | None = None
+    protocols: tuple[str, ...] = ()
+    faults: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +109,7 @@ class Drive:
         events: starts the drive.
         duration: s.
         length: of the way driven, m.
+        faults: what goes wrong.
     """
 
     layout: WhiskerLayout
@@ -110,6 +119,7 @@ class Drive:
     events: Callable[[], Iterator[Event]]
     duration: float
     length: float
+    faults: FaultSchedule = field(default_factory=FaultSchedule)
 
 
 def simulated_drive(settings: SimulationSettings) -> Drive:
@@ -117,18 +127,28 @@ def simulated_drive(settings: SimulationSettings) -> Drive:
 
     Raises:
         WorldError: no such world or scenario.
+        FaultFileError: no such faults.
         OSError: a file cannot be written.
     """
     robot = _build(settings)
-    calibration = write_calibration(settings.out.absolute(), robot.layout, settings.robot.seed)
+    layout, screws = robot.layout, settings.robot.screws
+    calibration = write_calibration(settings.out.absolute(), layout, settings.robot.seed)
+    faults = FaultSchedule()
+    if settings.faults is not None:
+        faults = faults_from_option(settings.faults, robot.duration, rows=layout.rows, cols=layout.cols)
+    rest = robot.hall.field(np.zeros((layout.count, 2)), np.eye(3))
+    sensors = SensorFaults(
+        faults.of_sensors(), rest, cols=layout.cols, ticks_per_turn=screws.ticks_per_turn, seed=settings.robot.seed
+    )
     return Drive(
-        robot.layout,
+        layout,
         calibration,
         settings.robot.sensor_period_us,
-        settings.robot.screws.ticks_per_turn,
-        robot.events,
+        screws.ticks_per_turn,
+        lambda: sensors.apply(robot.events()),
         robot.duration,
         robot.motion.length,
+        faults,
     )
 
 
@@ -164,9 +184,18 @@ def serve(settings: SimulationSettings, drive: Drive, on_ready: Callable[[ReadyR
     out = settings.out.absolute()
     (out / CALIBRATION).write_text(drive.calibration, encoding="utf-8")
     (out / LAYOUT).write_text(layouts.to_json(drive.layout), encoding="utf-8")
-    devices = plug_in(out / PORTS, tuple(EVENT_OF_DEVICE), time.monotonic_ns(), settings.clocks)
+    protocols = parse_protocols(settings.protocols)
+    devices = plug_in(
+        out / PORTS,
+        tuple(EVENT_OF_DEVICE),
+        time.monotonic_ns(),
+        settings.clocks,
+        protocols=protocols,
+        faults=drive.faults,
+        seed=settings.robot.seed,
+    )
     ports = {name: device.path for name, device in devices.items()}
-    (out / CONFIGURATION).write_text(_configuration(settings, drive, out), encoding="utf-8")
+    (out / CONFIGURATION).write_text(_configuration(settings, drive, out, devices), encoding="utf-8")
     with TruthFile(out / TRUTH) as truth:
 
         def write_truth(event: TruthEvent, start: StartTime) -> None:
@@ -236,10 +265,15 @@ def _build(settings: SimulationSettings) -> SimulatedRobot:
     return build_robot(settings.world, settings.scenario, settings.engine, settings.robot)
 
 
-def _configuration(settings: SimulationSettings, drive: Drive, folder: Path) -> str:
+def _configuration(
+    settings: SimulationSettings, drive: Drive, folder: Path, devices: Mapping[str, SerialDevice] | None = None
+) -> str:
     built_in = drive.layout.name in layouts.BUILT_IN
+    ports = [Port(name, folder / PORTS / name) for name in EVENT_OF_DEVICE]
+    if devices is not None:
+        ports = [Port(d.role, d.path, d.protocol.partition(":")[0], name) for name, d in devices.items()]
     return configuration_text(
-        {name: folder / PORTS / name for name in EVENT_OF_DEVICE},
+        ports,
         drive.layout.name if built_in else LAYOUT,
         ticks_per_turn=drive.ticks_per_turn,
         mount_rpy_deg=settings.robot.imu.mount_rpy_deg,

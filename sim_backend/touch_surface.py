@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backend.world import World
-
 FloatArray = NDArray[np.float64]
+
+#: Heights at places x, y of equal shape, m.
+HeightFunction = Callable[[FloatArray, FloatArray], FloatArray]
+#: Range of x and range of y, m.
+Extent = tuple[tuple[float, float], tuple[float, float]]
 
 #: Node distance of the sampled surface, m: the edges of objects become ramps of this width, and on ground that
 #: curves by 1 mm over 20 mm the chords lie within 0.02 mm.
@@ -24,13 +28,13 @@ class Surface(Protocol):
 
 
 class SampledHeight:
-    """Ground and objects of a world as one height field, bilinear between nodes 5 mm apart: z - height(x, y)."""
+    """Ground and objects as one height field, bilinear between nodes 5 mm apart: z - height(x, y)."""
 
-    def __init__(self, world: World, cell: float = SAMPLING) -> None:
-        """Sample the world's surface over the extent of its ground; beyond, the edge's height goes on."""
-        (x0, x1), (y0, y1) = world.ground.extent
+    def __init__(self, height: HeightFunction, extent: Extent, cell: float = SAMPLING) -> None:
+        """Sample `height` over ranges of x and y, m; beyond, the edge's height goes on."""
+        (x0, x1), (y0, y1) = extent
         x, y = np.arange(x0, x1 + cell / 2, cell), np.arange(y0, y1 + cell / 2, cell)
-        z = world.height(*np.meshgrid(x, y))
+        z = height(*np.meshgrid(x, y))
         self._start = np.array([[x0], [y0]])
         self._scale = 1.0 / cell
         self._last = np.array([[len(x) - 2 + 1 - 1e-9], [len(y) - 2 + 1 - 1e-9]])
