@@ -15,22 +15,15 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from drivers.recording_reader import Recording
+from robominer_slam.cli.evaluate import truth_of
 from robominer_slam.evaluation.report import DriveReport, drive_report
 from robominer_slam.evaluation.trajectory import Trajectory
 from robominer_slam.frame_result import FrameResult
-from robominer_slam.geometry import from_vector7
 from robominer_slam.graph_json import graph_json
 from robominer_slam.replay import prepare, replay
 
 METHODS = ("thesis",)
 SOURCES = ("fused", "odometry")
-
-
-def truth_of(path: Path) -> Trajectory:
-    truths = [truth for _, truth in Recording(path).ground_truth()]
-    stamps = np.array([truth.stamp_ns for truth in truths], dtype=np.int64)
-    return Trajectory(stamps, from_vector7(np.array([truth.pose for truth in truths])))
 
 
 def measure(path: Path, method: str, source: str) -> tuple[DriveReport, float]:

@@ -37,7 +37,7 @@ def build(world_name: str, engine: str) -> Engine:
     world = worlds.load(world_name)
     layout = layouts.BUILT_IN[world.layout]()
     motion = base_motion_on(world, WaypointPath(world.scenario(1)))
-    offset = np.arange(layout.count) * (0.96 * INTERVAL / layout.count)
+    offset = np.arange(layout.count, dtype=np.float64) * (0.96 * INTERVAL / layout.count)
     return build_engine(engine, world, layout, motion, read_offset=offset, interval=INTERVAL)
 
 

@@ -64,6 +64,7 @@ class Pipeline:
         self._last_result: BackendResult | None = None
         self._odometry_at_result: FloatArray | None = None
         self._odometry_of_keyframe: dict[int, FloatArray] = {}
+        self._first_keyframe_covariance = np.zeros((3, 3))
         self._contact_ns: int | None = None
         self._odometry_ns: int | None = None
         self._last_frame: HallFrame | None = None
@@ -157,6 +158,8 @@ class Pipeline:
         keyframe = self._composite.add(stamp, T_odom_base, points)
         if keyframe is not None:
             self._odometry_of_keyframe[keyframe.id] = odometry.covariance
+            if keyframe.id == 0:
+                self._first_keyframe_covariance = odometry.covariance
             self.runner.submit(keyframe)
         return keyframe
 
@@ -166,14 +169,17 @@ class Pipeline:
         self._odometry_at_result = self._odometry_of_keyframe.pop(result.keyframe.id)
 
     def _covariance(self, odometry: OdometryState) -> FloatArray:
-        """Covariance of (x, y, yaw) in map: the keyframe's from the graph, grown by odometry since."""
+        """Covariance of (x, y, yaw) in map: the keyframe's, grown by odometry since.
+
+        The graph takes its first keyframe as exact; the way to it from the map's origin was odometry's.
+        """
         c, s = self._T_map_odom[0, 0], self._T_map_odom[1, 0]
         R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         if self._last_result is None or self._odometry_at_result is None:
             covariance: FloatArray = R @ odometry.covariance @ R.T
             return covariance
         grown = np.maximum(np.diag(odometry.covariance - self._odometry_at_result), 0.0)
-        covariance = self._last_result.covariance + R @ np.diag(grown) @ R.T
+        covariance = self._first_keyframe_covariance + self._last_result.covariance + R @ np.diag(grown) @ R.T
         return covariance
 
     def _state(self, stamp: int) -> LocalizationState:

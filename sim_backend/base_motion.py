@@ -8,7 +8,6 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from sim_backend.waypoints import WaypointPath
 
@@ -106,7 +105,11 @@ class LevelGrid:
             acceleration[early] += np.outer((6 - 12 * s) / down.time**2 * (s < 1.0), offset)
         omega, alpha = np.zeros((n, 3)), np.zeros((n, 3))
         omega[:, 2], alpha[:, 2] = motion.velocity[:, 2], motion.acceleration[:, 2]
-        R = Rotation.from_rotvec(motion.pose * [0.0, 0.0, 1.0]).as_matrix()
+        R = np.zeros((n, 3, 3))
+        R[:, 0, 0] = R[:, 1, 1] = np.cos(motion.pose[:, 2])
+        R[:, 1, 0] = np.sin(motion.pose[:, 2])
+        R[:, 0, 1] = -R[:, 1, 0]
+        R[:, 2, 2] = 1.0
         return BaseStates(position, R, velocity, acceleration, omega, alpha)
 
 
@@ -159,8 +162,7 @@ class FollowGround:
         n, h = len(t), self.STEP
         position, R = self._pose(np.concatenate([t - h, t, t + h]))
         p, R = position.reshape(3, n, 3), R.reshape(3, n, 3, 3)
-        ahead = Rotation.from_matrix(R[2] @ R[1].swapaxes(-1, -2)).as_rotvec()
-        behind = Rotation.from_matrix(R[1] @ R[0].swapaxes(-1, -2)).as_rotvec()
+        ahead, behind = _small_turn(R[2] @ R[1].swapaxes(-1, -2)), _small_turn(R[1] @ R[0].swapaxes(-1, -2))
         return BaseStates(
             p[1],
             R[1],
@@ -185,3 +187,8 @@ class FollowGround:
         position = level.position.copy()
         position[:, 2] += height + self.ride_height
         return position, R
+
+
+def _small_turn(R: FloatArray) -> FloatArray:
+    """Rotation vectors, shape (n, 3), rad, of turns of milliradians, to the third order."""
+    return 0.5 * np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=-1)

@@ -98,9 +98,7 @@ class DeviceServer:
     def serve(self, events: Iterator[Event]) -> StartTime:
         """Send all events when they are due, from now on; returns when the last is sent or after `stop`."""
         ahead: queue.Queue[Event | BaseException | None] = queue.Queue(AHEAD)
-        producer = threading.Thread(
-            target=self._produce, args=(events, ahead), name="simulation", daemon=True
-        )
+        producer = threading.Thread(target=self._produce, args=(events, ahead), name="simulation", daemon=True)
         producer.start()
         try:
             # The first events take the longest: start the clock when they are there.
@@ -148,9 +146,7 @@ class DeviceServer:
             last = error
         self._put(ahead, last)
 
-    def _put(
-        self, ahead: queue.Queue[Event | BaseException | None], item: Event | BaseException | None
-    ) -> bool:
+    def _put(self, ahead: queue.Queue[Event | BaseException | None], item: Event | BaseException | None) -> bool:
         while not (self._stop.is_set() or self._abandoned.is_set()):
             with contextlib.suppress(queue.Full):
                 ahead.put(item, timeout=0.1)

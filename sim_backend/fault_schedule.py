@@ -229,9 +229,7 @@ def _target(kind: Target, rest: dict[str, object], where: str) -> tuple[int, int
         case "device":
             device = rest.pop("device", None)
             if not isinstance(device, str) or not device:
-                raise FaultFileError(
-                    f"{where}: device is {device!r}, expected a device's name, such as 'whiskers'"
-                )
+                raise FaultFileError(f"{where}: device is {device!r}, expected a device's name, such as 'whiskers'")
             return device
     return None
 

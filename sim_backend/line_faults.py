@@ -18,9 +18,7 @@ STALL_BUFFER = 1 << 20
 _DAMAGE = ("bytes_lost", "bytes_flipped", "bytes_duplicated")
 
 
-def damaged(
-    data: bytes, rng: np.random.Generator, *, lost: float, flipped: float, duplicated: float
-) -> bytes:
+def damaged(data: bytes, rng: np.random.Generator, *, lost: float, flipped: float, duplicated: float) -> bytes:
     """Bytes after a bad line: each is lost, has one bit flipped, or comes twice, with these probabilities each."""
     values = np.frombuffer(data, np.uint8).copy()
     flips = rng.random(len(values)) < flipped
@@ -170,9 +168,7 @@ class FaultyLine:
         active = [fault for fault in self._damage if fault.active(self._time)]
         if not active:
             return packet
-        lost, flipped, duplicated = (
-            sum(f.number("rate") for f in active if f.kind == kind) for kind in _DAMAGE
-        )
+        lost, flipped, duplicated = (sum(f.number("rate") for f in active if f.kind == kind) for kind in _DAMAGE)
         return damaged(packet, self._rng, lost=lost, flipped=flipped, duplicated=duplicated)
 
 

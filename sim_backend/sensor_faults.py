@@ -121,9 +121,7 @@ class SensorFaults:
         if not self._extra_angle.any():
             return event
         extra_ticks = np.floor(self._extra_angle * self._ticks_per_rad).astype(np.int64)
-        return replace(
-            event, ticks=event.ticks + extra_ticks, angle=event.angle + extra_ticks / self._ticks_per_rad
-        )
+        return replace(event, ticks=event.ticks + extra_ticks, angle=event.angle + extra_ticks / self._ticks_per_rad)
 
 
 def bent(field_mT: FloatArray, tilt_deg: float, azimuth_deg: float) -> FloatArray:

@@ -213,9 +213,7 @@ def plug_in(
     for fault in faults.faults if faults is not None else ():
         if KINDS[fault.kind].target == "device" and fault.target not in known:
             there = ", ".join(sorted(known))
-            raise FaultFileError(
-                f"{fault.kind} at {fault.start:g} s: no device {fault.target!r}; there are {there}"
-            )
+            raise FaultFileError(f"{fault.kind} at {fault.start:g} s: no device {fault.target!r}; there are {there}")
     devices: dict[str, SerialDevice] = {}
     for role in names:
         for name in boards[role]:

@@ -103,3 +103,19 @@ def test_rezero_and_localize(model):
     pipeline.localize(1.0, -2.0, 0.5)
     (placed,) = pipeline.add("whiskers", frame(80, model))
     np.testing.assert_allclose(placed.T_map_base[:2, 3], [1.0, -2.0], atol=1e-9)
+
+
+def test_the_covariance_never_falls_to_zero_once_the_robot_has_moved(model):
+    pipeline = pipeline_of(model, "")
+    matrix_angle = np.array([-1.0, -1.0, 1.0, 1.0]) * 0.15 / (0.078 * np.tan(np.deg2rad(30.0)))
+    variances = []
+    for ms in range(0, 6000, 10):
+        results = pipeline.add("imu", ImuSample(ms * MS, np.zeros(3), np.array([0, 0, 9.81])))
+        if ms % 20 == 0:
+            results += pipeline.add("screws", ScrewAngles(ms * MS, matrix_angle * ms * 1e-3))
+        if ms % 40 == 0:
+            results += pipeline.add("whiskers", frame(ms, model))
+        variances += [result.covariance[0, 0] for result in results if result.odometry.x > 0.01]
+    assert pipeline.runner is not None
+    assert len(variances) > 100
+    assert min(variances) > 1e-8

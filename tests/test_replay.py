@@ -50,6 +50,17 @@ def test_two_replays_are_the_same_bit_for_bit(recorded, tmp_path):
         assert (first / name).read_bytes() == (second / name).read_bytes()
 
 
+def test_evaluate_takes_the_truth_from_the_recording(recorded, tmp_path):
+    replay(recorded, tmp_path)
+    done = run("evaluate", "--truth", str(recorded / "drive.mcap"), "--odometry", str(tmp_path / "odometry.tum"),
+               "--slam", str(tmp_path / "slam.tum"), "--graph", str(tmp_path / "graph.json"), "--figure",
+               str(tmp_path / "path.png"), "--json")  # fmt: skip
+    report = json.loads(done.stdout)
+    assert report["slam"]["frames"] == 625
+    assert report["odometry"]["position_m"]["mean"] < 0.2
+    assert (tmp_path / "path.png").stat().st_size > 10_000
+
+
 def test_replay_with_a_configuration_file_equals_the_recordings_own(recorded, tmp_path):
     (tmp_path / "own").mkdir()
     (tmp_path / "file").mkdir()

@@ -68,13 +68,8 @@ def test_spherical_values_are_azimuth_polar_and_magnitude_of_the_folded_field():
 
 def test_a_bus_error_repeats_the_last_value_and_a_sensor_that_never_answered_is_zero():
     encoder = Rm3WhiskerEncoder(1, 2, "cartesian")
-    assert (
-        i16(encoder.compressed(np.array([True, False]), np.full((2, 3), 1.0))).tolist() == [100] * 3 + [0] * 3
-    )
-    assert (
-        i16(encoder.compressed(np.array([False, True]), np.full((2, 3), 2.0))).tolist()
-        == [100] * 3 + [200] * 3
-    )
+    assert i16(encoder.compressed(np.array([True, False]), np.full((2, 3), 1.0))).tolist() == [100] * 3 + [0] * 3
+    assert i16(encoder.compressed(np.array([False, True]), np.full((2, 3), 2.0))).tolist() == [100] * 3 + [200] * 3
 
 
 @pytest.mark.parametrize(("electrical", "between"), [(None, 7), ((1200.0, 23.5), 15)])
@@ -139,9 +134,7 @@ def test_rvc_index_and_yaw_wrap():
 
 def test_the_mip_example_is_framed_byte_for_byte():
     data = bytes.fromhex("3E7A63A0BB8E3B297FE5BF7F")
-    assert mip.packet(0x80, [mip.field(0x04, data)]) == bytes.fromhex(
-        "7565800E0E043E7A63A0BB8E3B297FE5BF7F84EE"
-    )
+    assert mip.packet(0x80, [mip.field(0x04, data)]) == bytes.fromhex("7565800E0E043E7A63A0BB8E3B297FE5BF7F84EE")
 
 
 def parsed(packet):
@@ -166,9 +159,7 @@ def test_mip_samples_are_big_endian_in_g_with_z_down_and_carry_both_times():
     descriptor_set, fields = parsed(sample)
     assert descriptor_set == 0x80
     assert list(fields) == [0xD3, 0xD5, 0x04, 0x05]
-    np.testing.assert_allclose(
-        struct.unpack(">3f", fields[0x04]), [1 / 9.80665, -2 / 9.80665, -1.0], rtol=1e-6
-    )
+    np.testing.assert_allclose(struct.unpack(">3f", fields[0x04]), [1 / 9.80665, -2 / 9.80665, -1.0], rtol=1e-6)
     np.testing.assert_allclose(struct.unpack(">3f", fields[0x05]), [0.1, -0.2, -0.3], rtol=1e-6)
     assert struct.unpack(">Q", fields[0xD5]) == (17_250_001_000,)
     time_of_week, _, valid = struct.unpack(">dHH", fields[0xD3])
@@ -244,9 +235,7 @@ def test_protocols_are_chosen_by_device_with_the_firmwares_usual_variant():
             assert parse_protocol(device, name)[1] in (*variants, "")
 
 
-@pytest.mark.parametrize(
-    "option", ["whiskers", "imu=rm3-motor", "radar=framed", "imu=mip:asleep", "odometry=framed:x"]
-)
+@pytest.mark.parametrize("option", ["whiskers", "imu=rm3-motor", "radar=framed", "imu=mip:asleep", "odometry=framed:x"])
 def test_a_protocol_that_a_device_does_not_speak_is_refused_in_one_line(option):
     with pytest.raises(ProtocolError) as error:
         parse_protocols([option])

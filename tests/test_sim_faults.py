@@ -49,9 +49,7 @@ def frames(seconds=4, rate=25):
 def readings(*faults, sensor=1, seconds=4):
     """Readings of one sensor during the third second, healthy and with the faults; and the other sensors' events."""
     sick = SensorFaults(faults, REST, cols=2).apply(frames(seconds))
-    pairs = [
-        (h, s) for h, s in zip(frames(seconds), sick, strict=True) if 2 * SECOND <= h.time_ns < 3 * SECOND
-    ]
+    pairs = [(h, s) for h, s in zip(frames(seconds), sick, strict=True) if 2 * SECOND <= h.time_ns < 3 * SECOND]
     assert all((np.delete(h.field_mT, sensor, 0) == np.delete(s.field_mT, sensor, 0)).all() for h, s in pairs)
     return np.array([h.field_mT[sensor] for h, _ in pairs]), np.array([s.field_mT[sensor] for _, s in pairs])
 
@@ -92,9 +90,7 @@ def test_a_broken_whisker_shows_rest_whatever_it_touches_or_nothing_without_its_
 
 
 def test_a_bent_whisker_is_turned_by_the_stated_angle():
-    np.testing.assert_allclose(
-        bent(np.array([0.0, 0.0, 2.0]), 30.0, 90.0), [0.0, 1.0, np.sqrt(3.0)], atol=1e-12
-    )
+    np.testing.assert_allclose(bent(np.array([0.0, 0.0, 2.0]), 30.0, 90.0), [0.0, 1.0, np.sqrt(3.0)], atol=1e-12)
     healthy, sick = readings(whisker("whisker_bent", tilt_deg=10.0))
     cosine = (healthy * sick).sum(1) / np.linalg.norm(healthy, axis=1) / np.linalg.norm(sick, axis=1)
     assert np.degrees(np.arccos(cosine)).mean() == pytest.approx(9.0, abs=1.5)
@@ -117,9 +113,7 @@ def test_a_fault_of_a_whisker_outside_the_array_is_refused():
 def turns(speed, seconds=4):
     for k in range(seconds * 50):
         angle = np.full(4, speed * 0.02 * k)
-        yield EncoderEvent(
-            20 * MS * k, 20 * MS * k, np.floor(angle * 4096 / (2 * np.pi)).astype(np.int64), angle
-        )
+        yield EncoderEvent(20 * MS * k, 20 * MS * k, np.floor(angle * 4096 / (2 * np.pi)).astype(np.int64), angle)
 
 
 def test_one_screw_slips_only_while_the_screws_turn_and_its_count_stays_continuous():
@@ -147,12 +141,8 @@ def test_damage_loses_flips_and_doubles_bytes_at_the_stated_rates():
     data = bytes(range(256)) * 400
     rng = np.random.default_rng(1)
     assert damaged(data, rng, lost=0.0, flipped=0.0, duplicated=0.0) == data
-    assert len(damaged(data, rng, lost=0.01, flipped=0.0, duplicated=0.0)) == pytest.approx(
-        0.99 * len(data), rel=2e-3
-    )
-    assert len(damaged(data, rng, lost=0.0, flipped=0.0, duplicated=0.01)) == pytest.approx(
-        1.01 * len(data), rel=2e-3
-    )
+    assert len(damaged(data, rng, lost=0.01, flipped=0.0, duplicated=0.0)) == pytest.approx(0.99 * len(data), rel=2e-3)
+    assert len(damaged(data, rng, lost=0.0, flipped=0.0, duplicated=0.01)) == pytest.approx(1.01 * len(data), rel=2e-3)
     flipped = np.frombuffer(damaged(data, rng, lost=0.0, flipped=0.01, duplicated=0.0), np.uint8)
     difference = flipped ^ np.frombuffer(data, np.uint8)
     assert (difference > 0).mean() == pytest.approx(0.01, rel=0.15)
@@ -208,9 +198,7 @@ def line_of(folder, *faults, open_port=PseudoTerminal):
 
 def test_a_stall_holds_packets_back_and_delivers_them_in_one_burst(tmp_path):
     ports = []
-    with line_of(
-        tmp_path, Fault("stall", 1.0, 1.6), open_port=lambda p: ports.append(Recorder(p)) or ports[0]
-    ) as line:
+    with line_of(tmp_path, Fault("stall", 1.0, 1.6), open_port=lambda p: ports.append(Recorder(p)) or ports[0]) as line:
         heard = []
         for k in range(20):
             line.advance(0.1 * k)
@@ -253,9 +241,7 @@ def test_an_unplugged_device_vanishes_and_comes_back_under_the_stated_name(tmp_p
 
 def test_a_good_line_passes_everything_unharmed(tmp_path):
     port = Recorder(tmp_path / "one")
-    with line_of(
-        tmp_path, Fault("bytes_flipped", 5.0, 6.0, "one", {"rate": 1.0}), open_port=lambda _: port
-    ) as line:
+    with line_of(tmp_path, Fault("bytes_flipped", 5.0, 6.0, "one", {"rate": 1.0}), open_port=lambda _: port) as line:
         line.write(b"before")
         line.advance(5.5)
         line.write(b"during")
@@ -418,9 +404,7 @@ def test_every_protocol_is_served_beside_the_others_and_starts_when_its_host_has
     for motor_id, (name, speed) in enumerate(zip(screws, [1.0, 2.0, -3.0, -4.0], strict=True)):
         assert len(heard[name]) == 2 * 23
         assert heard[name][4] == motor_id
-        assert struct.unpack_from("<f", heard[name], 6)[0] == pytest.approx(
-            speed * 60 / (2 * np.pi), rel=1e-5
-        )
+        assert struct.unpack_from("<f", heard[name], 6)[0] == pytest.approx(speed * 60 / (2 * np.pi), rel=1e-5)
     settings = devices["screw_rear_left"].settings()
     assert (settings["protocol"], settings["screw"]) == ("rm3-motor", "rear_left")
     assert devices["whiskers"].settings()["representation"] == "cartesian"

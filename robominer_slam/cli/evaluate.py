@@ -10,8 +10,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from drivers.recording_reader import Recording
+from robominer_slam import geometry
 from robominer_slam.evaluation.report import ERROR_COLUMNS, DriveReport, drive_report, report_rows
-from robominer_slam.evaluation.trajectory import Trajectory, parse_tum
+from robominer_slam.evaluation.trajectory import Trajectory, TrajectoryError, parse_tum
 from robominer_slam.mapping.height_grid import height_grid
 
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
@@ -21,6 +23,21 @@ def read_tum(path: Path) -> Trajectory:
     """Read a TUM trajectory; raises TrajectoryError."""
     with path.open(encoding="utf-8") as file:
         return parse_tum(file, str(path))
+
+
+def truth_of(path: Path) -> Trajectory:
+    """Ground truth of a recording (.mcap) or of a TUM file.
+
+    Raises:
+        RecordingError, TrajectoryError: it cannot be read, or has no ground truth.
+    """
+    if path.suffix != ".mcap":
+        return read_tum(path)
+    truths = [truth for _, truth in Recording(path).ground_truth()]
+    if not truths:
+        raise TrajectoryError(f"{path}: no ground truth in this recording")
+    stamps = np.array([truth.stamp_ns for truth in truths], dtype=np.int64)
+    return Trajectory(stamps, geometry.from_vector7(np.array([truth.pose for truth in truths])))
 
 
 def print_report(report: DriveReport, title: str) -> None:
@@ -37,8 +54,8 @@ def print_report(report: DriveReport, title: str) -> None:
         console.print(f"{name:>40}: {value}", highlight=False)
 
 
-@click.command(epilog="Example: robominer-slam evaluate --truth truth.tum --odometry odometry.tum --slam slam.tum")
-@click.option("--truth", type=FILE, required=True, help="Ground truth, TUM format.")
+@click.command(epilog="Example: robominer-slam evaluate --truth drive.mcap --odometry odometry.tum --slam slam.tum")
+@click.option("--truth", type=FILE, required=True, help="Ground truth: TUM format, or the recording.")
 @click.option("--odometry", type=FILE, required=True, help="Dead reckoning alone, TUM format.")
 @click.option("--slam", type=FILE, required=True, help="Poses as published, TUM format.")
 @click.option("--graph", "graph_file", type=FILE, help="Pose graph, the JSON of map/graph.")
@@ -48,7 +65,7 @@ def evaluate(
     truth: Path, odometry: Path, slam: Path, graph_file: Path | None, figure: Path | None, as_json: bool
 ) -> None:
     """Errors of odometry and SLAM against ground truth, frame by frame, without alignment."""
-    trajectories = {name: read_tum(path) for name, path in (("truth", truth), ("odom", odometry), ("slam", slam))}
+    trajectories = {"truth": truth_of(truth), "odom": read_tum(odometry), "slam": read_tum(slam)}
     graph = json.loads(graph_file.read_text(encoding="utf-8")) if graph_file else {"keyframes": [], "edges": []}
     try:
         report = drive_report(trajectories["slam"], trajectories["odom"], trajectories["truth"], graph)
