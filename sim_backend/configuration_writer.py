@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,12 +21,15 @@ CALIBRATION_DATE = "2021-06-01"
 
 @dataclass(frozen=True, slots=True)
 class Port:
-    """A simulated device: what it measures (whiskers, imu, screws, odometry), its port, protocol and own name."""
+    """A simulated device: what it measures (whiskers, imu, screws, odometry), and its keys in the configuration."""
 
     role: str
-    path: Path
-    protocol: str = "framed"
-    name: str = ""
+    keys: Mapping[str, str | int]
+
+
+def framed_port(role: str, path: Path) -> Port:
+    """A device of the `framed` protocol."""
+    return Port(role, {"name": role, "port": str(path), "protocol": "framed", "baud": BAUD})
 
 
 def configuration_text(
@@ -63,7 +66,7 @@ def configuration_text(
         if name not in USED_BY_SOURCE[source]:
             continue
         device = tomlkit.table()
-        device.update({"name": port.name or name, "port": str(port.path), "protocol": port.protocol, "baud": BAUD})
+        device.update(port.keys)
         if name == "whiskers":
             device["calibration"] = CALIBRATION
         if name == "screws":

@@ -36,6 +36,8 @@ LONGEST_MOVE = 0.03
 TOLERANCE = 0.002
 #: Farthest slip to the side per frame, m: a tip that slips for good gets where it goes within a few frames.
 LONGEST_SLIP = 0.01
+#: Share of the friction that no rod lacks from one side: one pushed exactly in line would never turn over.
+CROOKED = 0.002
 #: Inclinations at which a falling rod is looked at, from lying to hanging, rad.
 FALL = np.deg2rad(np.arange(84.0, -0.1, -2.0))
 GRAVITY = 9.81
@@ -82,6 +84,8 @@ class QuasiStaticEngine:
         self._touching = np.zeros(n, dtype=np.bool_)
         self._tip = self._mount = self._gradient = np.full((3, n), np.nan)
         self._gap = np.full(n, np.nan)
+        # Every other whisker a little to the left, the rest to the right.
+        self._crooked = np.where(np.arange(n) % 2 == 0, CROOKED, -CROOKED)
         self._frame_is_even = False
         self._side = np.zeros((3, n))  # move to the side that the balance asks for in the next frame
         self._next = -round(settle_time / frame_interval)
@@ -237,6 +241,7 @@ class QuasiStaticEngine:
         outward = _dot(moved, d) - nd * _dot(moved, n)  # times q
         resisting = np.maximum(q + self._friction * np.sign(outward) * nd, 0.05)
         share = _dot(force, t) * resisting / (-self._friction * np.minimum(press, -1e-6))
+        share += self._crooked
         within = np.minimum(np.maximum(share, -0.95), 0.95)
         far = np.abs(outward) * within / np.sqrt((1.0 - within * within) * q2)
         far += LONGEST_SLIP * (share - np.minimum(np.maximum(share, -1.0), 1.0))

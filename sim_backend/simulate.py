@@ -22,6 +22,7 @@ from sim_backend.configuration_writer import (
     USED_BY_SOURCE,
     Port,
     configuration_text,
+    framed_port,
     write_calibration,
 )
 from sim_backend.device_protocols import parse_protocols
@@ -269,9 +270,10 @@ def _configuration(
     settings: SimulationSettings, drive: Drive, folder: Path, devices: Mapping[str, SerialDevice] | None = None
 ) -> str:
     built_in = drive.layout.name in layouts.BUILT_IN
-    ports = [Port(name, folder / PORTS / name) for name in EVENT_OF_DEVICE]
-    if devices is not None:
-        ports = [Port(d.role, d.path, d.protocol.partition(":")[0], name) for name, d in devices.items()]
+    if devices is None:
+        ports = [framed_port(name, folder / PORTS / name) for name in EVENT_OF_DEVICE]
+    else:
+        ports = [Port(device.role, device.settings()) for device in devices.values()]
     return configuration_text(
         ports,
         drive.layout.name if built_in else LAYOUT,

@@ -46,8 +46,10 @@ def test_a_dead_whisker_reads_zeros_from_its_time_on(tmp_path):
 
 
 def test_other_protocols_are_served_and_written_into_the_configuration(tmp_path):
-    done = run("simulate", "--engine", "quasi-static", "--max-time", "1", "--wait", "0", "--protocol",
-               "whiskers=rm3-compressed", "--protocol", "screws=rm3-motor", "--out", str(tmp_path), "--json")  # fmt: skip
+    done = run(
+        "simulate", "--engine", "quasi-static", "--max-time", "1", "--wait", "0", "--out", str(tmp_path), "--json",
+        "--protocol", "whiskers=rm3-compressed", "--protocol", "screws=rm3-motor",
+    )  # fmt: skip
     ready = json.loads(done.stdout.splitlines()[0])
     assert {"whiskers", "imu", "screw_front_right", "screw_rear_left"} <= set(ready["ports"])
     devices = tomllib.loads(Path(ready["configuration"]).read_text())["device"]
@@ -55,6 +57,7 @@ def test_other_protocols_are_served_and_written_into_the_configuration(tmp_path)
     assert spoken["whiskers"] == "rm3-compressed"
     assert spoken["screw_front_left"] == "rm3-motor"
     assert spoken["imu"] == "framed"
+    assert next(d for d in devices if d["name"] == "whiskers")["representation"] == "spherical"
 
 
 @pytest.mark.parametrize(
