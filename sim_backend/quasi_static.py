@@ -37,7 +37,7 @@ TOLERANCE = 0.002
 #: Farthest slip to the side per frame, m: a tip that slips for good gets where it goes within a few frames.
 LONGEST_SLIP = 0.01
 #: Share of the friction that no rod lacks from one side: one pushed exactly in line would never turn over.
-CROOKED = 0.002
+CROOKED = 0.00002
 #: Inclinations at which a falling rod is looked at, from lying to hanging, rad.
 FALL = np.deg2rad(np.arange(84.0, -0.1, -2.0))
 GRAVITY = 9.81
