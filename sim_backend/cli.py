@@ -25,7 +25,10 @@ A recording instead, as fast as it goes; the same with another odometry; and ser
 
 @click.command(epilog=EPILOG)
 @click.option(
-    "--world", default="thesis", show_default=True, help="World to drive in: thesis, random:SEED, flat or corridor."
+    "--world",
+    default="thesis",
+    show_default=True,
+    help="World to drive in: thesis, random:SEED, flat, corridor; for the rm3 layout tunnel, mine or mine:SEED:METRES.",
 )
 @click.option("--scenario", default=1, show_default=True, help="Scenario of the world, 1 to 5.")
 @click.option(

@@ -144,7 +144,7 @@ def simulated_drive(settings: SimulationSettings) -> Drive:
     return Drive(
         layout,
         calibration,
-        settings.robot.sensor_period_us,
+        robot.settings.sensor_period_us,
         screws.ticks_per_turn,
         lambda: sensors.apply(robot.events()),
         robot.duration,

@@ -22,7 +22,7 @@ def run(*arguments: str, expect: int = 0) -> subprocess.CompletedProcess[str]:
     return done
 
 
-@pytest.mark.parametrize("world", ["thesis", "random:3", "flat", "corridor"])
+@pytest.mark.parametrize("world", ["thesis", "random:3", "flat", "corridor", "tunnel", "mine"])
 def test_every_world_records_with_the_fast_engine(world, tmp_path):
     target = tmp_path / "drive.mcap"
     run("simulate", "--world", world, "--engine", "quasi-static", "--max-time", "6", "--out", str(tmp_path), "--record",
