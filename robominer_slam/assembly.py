@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from calibration.angle_estimator import AngleEstimator
 from calibration.polynomial import PolynomialModel
+from robominer_slam import geometry
 from robominer_slam.configuration.model import Configuration
 from robominer_slam.contacts import ContactModel
 from robominer_slam.estimation.fused_odometry import FusedOdometry
@@ -40,7 +41,7 @@ def build_pipeline(
         composite_scan=composite,
         runner=runner,
         imu_mounts={
-            device.name: rotation_from_rpy(*np.deg2rad(device.mount_rpy_deg))
+            device.name: geometry.matrix_from_rpy(np.deg2rad(device.mount_rpy_deg))
             for device in configuration.device
             if any(device.mount_rpy_deg)
         },
@@ -68,15 +69,3 @@ def _dead_reckoning(configuration: Configuration) -> DeadReckoning:
     screws = configuration.screws
     matrix = forward_matrix(screws.radius, np.deg2rad(screws.helix_angle_deg), screws.half_track, screws.half_base)
     return FusedOdometry(configuration.estimation, matrix)
-
-
-def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> FloatArray:
-    """Rz(yaw) Ry(pitch) Rx(roll), shape (3, 3): yaw, then pitch, then roll about the turned axes; rad."""
-    cr, sr, cp, sp, cy, sy = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
-    return np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )

@@ -88,7 +88,7 @@ class Pipeline:
         """Place the robot: map -> odom such that base_link is at (x, y) with heading yaw (m, rad) now."""
         stamp = self._last_frame.stamp_ns if self._last_frame is not None else 0
         T_odom_base = planar_pose(self._dead_reckoning.state_at(stamp))
-        self._T_map_odom = planar(x, y, yaw) @ geometry.inverse(T_odom_base)
+        self._T_map_odom = geometry.T_from_xyyaw([x, y, yaw]) @ geometry.inverse(T_odom_base)
 
     def start_new_map(self, composite_scan: CompositeScan | None, runner: BackendRunner | None) -> None:
         """Begin anew with an empty map whose frame is odom; what the former back-end still computes is dropped."""
@@ -203,15 +203,6 @@ class Pipeline:
         )
 
 
-def planar(x: float, y: float, yaw: float) -> FloatArray:
-    """Pose matrix, shape (4, 4), of a level body at (x, y, 0) with a heading."""
-    T = np.eye(4)
-    c, s = np.cos(yaw), np.sin(yaw)
-    T[:2, :2] = [[c, -s], [s, c]]
-    T[:2, 3] = x, y
-    return T
-
-
 def planar_pose(state: OdometryState) -> FloatArray:
     """Pose of base_link in odom, shape (4, 4)."""
-    return planar(state.x, state.y, state.yaw)
+    return geometry.T_from_xyyaw([state.x, state.y, state.yaw])

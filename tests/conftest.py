@@ -6,16 +6,22 @@ import struct
 import zlib
 from pathlib import Path
 
+import numpy as np
 import pytest
 from cobs import cobs
 from hypothesis import settings
 
-import robominer_slam  # noqa: F401 - first: it sets BLAS to one thread before numpy is loaded
+from robominer_slam import geometry
 
 settings.register_profile("default", deadline=None, max_examples=60)
 settings.load_profile("default")
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+def planar(x: float, y: float, yaw: float) -> np.ndarray:
+    """Pose matrix of a level body."""
+    return geometry.T_from_xyyaw([x, y, yaw])
 
 
 def make_packet(kind: int, sequence: int, time_us: int, payload: bytes, *, version: int = 1) -> bytes:

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from drivers.measurement import ImuSample, OdometrySample, ScrewAngles
-from robominer_slam.assembly import rotation_from_rpy
+from robominer_slam import geometry
 from robominer_slam.configuration.model import EstimationSection
 from robominer_slam.estimation.fused_odometry import FusedOdometry, motion, motion_jacobian
 from robominer_slam.estimation.integrated_odometry import IntegratedOdometry, advance
@@ -54,7 +54,7 @@ def test_screw_kinematics_are_those_of_the_robot():
 
 def test_rpy_means_yaw_then_pitch_then_roll():
     np.testing.assert_allclose(
-        rotation_from_rpy(0.1, -0.4, 2.0), Rotation.from_euler("ZYX", [2.0, -0.4, 0.1]).as_matrix(), atol=1e-12
+        geometry.matrix_from_rpy([0.1, -0.4, 2.0]), Rotation.from_euler("ZYX", [2.0, -0.4, 0.1]).as_matrix(), atol=1e-12
     )
 
 

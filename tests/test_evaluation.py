@@ -9,7 +9,7 @@ from evo.core import trajectory as evo_trajectory
 from scipy.spatial.transform import Rotation, Slerp
 
 from robominer_slam import geometry
-from robominer_slam.evaluation.metrics import ErrorStatistics, roll_pitch_yaw, trajectory_errors
+from robominer_slam.evaluation.metrics import ErrorStatistics, trajectory_errors
 from robominer_slam.evaluation.pose_graph_errors import closure_errors
 from robominer_slam.evaluation.report import drive_report, report_rows
 from robominer_slam.evaluation.trajectory import Trajectory, TrajectoryError, interpolate, parse_tum, tum_line
@@ -58,7 +58,7 @@ def test_heading_errors_equal_evo():
 
 def test_roll_pitch_yaw_equal_scipy():
     R = Rotation.random(50, random_state=0)
-    np.testing.assert_allclose(roll_pitch_yaw(R.as_matrix()), R.as_euler("ZYX")[:, ::-1], atol=1e-9)
+    np.testing.assert_allclose(geometry.rpy_of(R.as_matrix()), R.as_euler("ZYX")[:, ::-1], atol=1e-9)
 
 
 def test_interpolation_is_linear_in_place_and_spherical_in_heading():

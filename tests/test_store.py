@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from robominer_slam import geometry
-from robominer_slam.pipeline import planar
 from robominer_slam.slam.keyframe import BackendResult, GraphEdge, Keyframe
 from robominer_slam.store import MapStore, StoreError, open_database, pack_points, unpack_points
+from tests.conftest import planar
 
 
 def result(k: int) -> BackendResult:

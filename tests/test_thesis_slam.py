@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from robominer_slam.configuration.model import ThesisSection
-from robominer_slam.pipeline import planar
 from robominer_slam.slam.backend_runner import SynchronousRunner, ThreadedRunner
 from robominer_slam.slam.composite_scan import CompositeScan, voxel_filter
 from robominer_slam.slam.fitness_information import information_from_fitness
 from robominer_slam.slam.keyframe import BackendResult, Keyframe
 from robominer_slam.slam.registration import ScanTarget, register
 from robominer_slam.slam.thesis import ThesisBackend
+from tests.conftest import planar
 
 #: The made drive is short and rough: closures after 1 m, and no dependence on the defaults that a search has found.
 ROUGH = ThesisSection(min_travel=1.0, correspondence_distance=0.1, closure_spacing=0.3, odometry_sigma=0.01)

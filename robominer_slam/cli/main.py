@@ -48,10 +48,12 @@ ENTRY_POINT_GROUP = "robominer_slam.commands"
 class _Commands(click.Group):
     """Our own subcommands and those that other packages register by entry point."""
 
-    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
-        return sorted([*COMMANDS, *(point.name for point in entry_points(group=ENTRY_POINT_GROUP))])
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return sorted(
+            [*super().list_commands(ctx), *COMMANDS, *(point.name for point in entry_points(group=ENTRY_POINT_GROUP))]
+        )
 
-    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:  # noqa: ARG002 - click's signature
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
         if name in COMMANDS:
             module, attribute = COMMANDS[name].split(":")
             command: click.Command = getattr(importlib.import_module(module), attribute)
@@ -59,7 +61,7 @@ class _Commands(click.Group):
         for point in entry_points(group=ENTRY_POINT_GROUP, name=name):
             loaded: click.Command = point.load()
             return loaded
-        return None
+        return super().get_command(ctx, name)
 
 
 @click.group(

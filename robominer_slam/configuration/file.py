@@ -5,11 +5,13 @@ from __future__ import annotations
 import difflib
 import tomllib
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import tomlkit
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails
+from tomlkit.items import Table
 
 from robominer_slam.configuration.model import Configuration
 
@@ -44,7 +46,7 @@ def parse(text: str, where: str) -> Configuration:
         raise ConfigurationError("\n".join(_line(where, one) for one in error.errors())) from error
 
 
-def _line(where: str, error: Any) -> str:  # noqa: ANN401 - pydantic's ErrorDetails is a plain dict
+def _line(where: str, error: ErrorDetails) -> str:
     location = error["loc"]
     key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location).lstrip(".")
     section, field = _find(location)
@@ -89,7 +91,7 @@ def _find(location: tuple[int | str, ...]) -> tuple[type[BaseModel] | None, Fiel
     return section, field
 
 
-def _section_of(annotation: Any) -> type[BaseModel] | None:  # noqa: ANN401 - a type annotation of any form
+def _section_of(annotation: object) -> type[BaseModel] | None:
     candidates = [annotation, *get_args(annotation)]
     return next((c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)), None)
 
@@ -114,7 +116,7 @@ def to_toml(configuration: Configuration, *, comments: bool = True) -> str:
     return text
 
 
-def _table(section: BaseModel, comments: bool) -> Any:  # noqa: ANN401 - tomlkit's table type is private
+def _table(section: BaseModel, comments: bool) -> Table:
     table = tomlkit.table()
     for name, value in section:
         field = type(section).model_fields[name]

@@ -2,34 +2,37 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, field_validator
+from pydantic import AfterValidator, Field, field_validator
 
 from robominer_slam.configuration.parameter import Section, parameter
+
+
+def _one_key_chunk(value: str) -> str:
+    if not value or any(c in "/*$?# " for c in value):
+        raise ValueError("expected a name without spaces and without / * $ ? #")
+    return value
+
+
+#: A name that becomes one chunk of a Zenoh key.
+KeyChunk = Annotated[str, AfterValidator(_one_key_chunk)]
 
 
 class RobotSection(Section):
     """Which robot this is."""
 
-    id: str = parameter("rm3", "", "part of every key on the network: robominer/<id>/...")
+    id: KeyChunk = parameter("rm3", "", "part of every key on the network: robominer/<id>/...")
     layout: str = parameter("thesis-grid", "", "built-in name (thesis-grid, rm3) or path of a layout file")
     role: Literal["all", "drivers", "slam"] = parameter(
         "all", "", "drivers: devices to the network only; slam: from the network; all: both on one board"
     )
 
-    @field_validator("id")
-    @classmethod
-    def _one_key_chunk(cls, value: str) -> str:
-        if not value or any(c in "/*$?# " for c in value):
-            raise ValueError("expected a name without spaces and without / * $ ? #")
-        return value
-
 
 class DeviceSection(Section):
     """One port and what is on it."""
 
-    name: str = Field(description="the device's name in status, logs and keys", json_schema_extra={"unit": ""})
+    name: KeyChunk = Field(description="the device's name in status, logs and keys", json_schema_extra={"unit": ""})
     port: str = Field(description="path, usb:VID:PID[:SERIAL] or auto", json_schema_extra={"unit": ""})
     protocol: Literal["framed"] = parameter("framed", "", "what the device speaks")
     baud: int = parameter(115200, "bit/s", "the Arduino default; USB CDC devices ignore it", low=1200, high=12_000_000)
@@ -41,13 +44,6 @@ class DeviceSection(Section):
     acceleration: Literal["specific_force", "gravity_free"] = parameter(
         "specific_force", "", "gravity_free where the IMU's driver has removed gravity already"
     )
-
-    @field_validator("name")
-    @classmethod
-    def _one_key_chunk(cls, value: str) -> str:
-        if not value or any(c in "/*$?# " for c in value):
-            raise ValueError("expected a name without spaces and without / * $ ? #")
-        return value
 
 
 class TopicsSection(Section):

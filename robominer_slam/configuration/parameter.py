@@ -14,7 +14,7 @@ class Section(BaseModel):
 
 
 def parameter(
-    default: Any,  # noqa: ANN401 - a default has the type of the field that it stands for
+    default: object,
     unit: str,
     reason: str,
     *,

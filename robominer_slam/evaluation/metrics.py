@@ -69,18 +69,10 @@ class TrajectoryErrors:
         return heading
 
 
-def roll_pitch_yaw(R: FloatArray) -> FloatArray:
-    """Roll, pitch, yaw (..., 3), rad, of rotations (..., 3, 3) = Rz(yaw) Ry(pitch) Rx(roll)."""
-    roll = np.arctan2(R[..., 2, 1], R[..., 2, 2])
-    pitch = -np.arcsin(np.clip(R[..., 2, 0], -1.0, 1.0))
-    yaw = np.arctan2(R[..., 1, 0], R[..., 0, 0])
-    return np.stack([roll, pitch, yaw], axis=-1)
-
-
 def component_errors(T_estimate: FloatArray, T_truth: FloatArray) -> FloatArray:
     """Six components of estimate minus truth, shape (..., 6), of poses (..., 4, 4)."""
     position = T_estimate[..., :3, 3] - T_truth[..., :3, 3]
-    angles = roll_pitch_yaw(T_estimate[..., :3, :3]) - roll_pitch_yaw(T_truth[..., :3, :3])
+    angles = geometry.rpy_of(T_estimate) - geometry.rpy_of(T_truth)
     return np.concatenate([position, geometry.wrap_angle(angles)], axis=-1)
 
 
