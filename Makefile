@@ -3,13 +3,14 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types bench clean venv
+.PHONY: demo test lint types bench recordings clean venv
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo    simulated robot + daemon + report, about three minutes"
 	@echo "make test    lint, types and tests, under eight minutes"
 	@echo "make bench   accuracy and speed tables (long)"
+	@echo "make recordings   the five scenarios as recordings, some minutes"
 
 $(VENV)/.sim: pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -38,6 +39,9 @@ test: lint types
 
 bench: $(VENV)/.dev
 	$(BIN)/python benchmarks/pose_graph.py
+
+recordings: $(VENV)/.sim
+	$(BIN)/python -m benchmarks.make_recordings
 
 clean:
 	rm -rf $(VENV) out build dist .mypy_cache .ruff_cache .pytest_cache

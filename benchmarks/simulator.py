@@ -1,9 +1,11 @@
-"""How many times faster than real time the simulator runs: both engines, both layouts, with and without sensors.
+"""How many times faster than real time the simulator runs, and how right its physics is.
 
 Usage: python -m benchmarks.simulator [--seconds S]
 
-Prints a Markdown table. `tips` is the engine alone, read after read; `all sensors` is every event of the robot
-(Hall fields, IMU, screws, odometry, truth), as a recording gets them. Each figure is the best of three.
+Prints two Markdown tables. Speed: `tips` is the engine alone, read after read; `all sensors` is every event of the
+robot (Hall fields, IMU, screws, odometry, truth), as a recording gets them; processor time of one core, each figure
+the best of three. Physics checks: a bent and a swinging whisker against formulas, sinking along the rods, and how far
+the tips of the two engines are apart (`benchmarks.physics_checks`).
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from benchmarks import physics_checks
 from robominer_slam import layout as layouts
 from sim_backend import world as worlds
 from sim_backend.engines import base_motion_on, build_engine
@@ -26,8 +29,11 @@ REPEATS = 3
 CASES = (
     ("thesis", "physics"),
     ("thesis", "quasi-static"),
+    ("random:1", "physics"),
     ("random:1", "quasi-static"),
+    ("tunnel", "physics"),
     ("tunnel", "quasi-static"),
+    ("mine", "physics"),
     ("mine", "quasi-static"),
 )
 
@@ -54,9 +60,9 @@ def robot_factor(world_name: str, engine: str, seconds: float) -> float:
 
 
 def _factor(seconds: float, run: Callable[[], object]) -> float:
-    start = time.perf_counter()
+    start = time.process_time()
     run()
-    return seconds / (time.perf_counter() - start)
+    return seconds / (time.process_time() - start)
 
 
 def main() -> None:
@@ -70,6 +76,8 @@ def main() -> None:
         tips = max(tips_factor(world_name, engine, seconds) for _ in range(REPEATS))
         everything = max(robot_factor(world_name, engine, seconds) for _ in range(REPEATS))
         print(f"| {world_name} | {layout} | {engine} | {tips:.1f} | {everything:.1f} |", flush=True)
+    print()
+    physics_checks.print_table(seconds)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from drivers.ground_truth import TYPENAME as GROUND_TRUTH_TYPE
+from drivers.ground_truth import WHISKERS_TYPENAME as WHISKER_TRUTH_TYPE
 from drivers.measurement_messages import (
     IMU,
     JOINT_STATE,
@@ -21,7 +22,9 @@ SCHEMA_ENCODING = "ros2msg"
 MESSAGE_ENCODING = "cdr"
 METADATA_NAME = "robominer_slam"
 SENSOR_PERIOD_KEY = "sensor_period_us"
+#: Meanings of the topics on which a simulator tells the truth; nothing that is replayed.
 GROUND_TRUTH = "ground_truth"
+WHISKER_TRUTH = "whisker_truth"
 
 
 class RecordingError(Exception):
@@ -54,6 +57,7 @@ MEANINGS: dict[str, TopicMeaning] = {
     },
     "odometry": TopicMeaning("odometry/twist", (TWIST_STAMPED, ODOMETRY)),
     GROUND_TRUTH: TopicMeaning(GROUND_TRUTH, (GROUND_TRUTH_TYPE,)),
+    WHISKER_TRUTH: TopicMeaning("ground_truth/whiskers", (WHISKER_TRUTH_TYPE,)),
 }
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Schema
@@ -13,7 +14,7 @@ from mcap.records import Message as McapMessage
 
 from drivers import ground_truth, measurement_messages
 from drivers.counters import Counters
-from drivers.ground_truth import GroundTruth
+from drivers.ground_truth import GroundTruth, WhiskerTruth
 from drivers.mcap_salvage import DAMAGE, Salvage
 from drivers.measurement import Measurement
 from drivers.recording_contents import TopicSummary, read_contents
@@ -22,6 +23,7 @@ from drivers.recording_format import (
     MEANINGS,
     MESSAGE_ENCODING,
     SENSOR_PERIOD_KEY,
+    WHISKER_TRUTH,
     RecordingError,
     resolve_topics,
 )
@@ -30,6 +32,8 @@ from drivers.ros_messages import MessageError
 __all__ = ["RawMessage", "Recording", "RecordingError", "TopicSummary"]
 
 log = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +115,7 @@ class Recording:
         self.counters = Counters()
         for raw in self.raw_messages():
             meaning = self._meaning(raw)
-            if meaning is None or meaning == GROUND_TRUTH:
+            if meaning is None or meaning in (GROUND_TRUTH, WHISKER_TRUTH):
                 continue
             measurement = measurement_messages.decode(
                 raw.data,
@@ -129,17 +133,31 @@ class Recording:
         Raises:
             RecordingError: the file turns out to be damaged.
         """
-        wanted = {topic for topic, meaning in self._meanings.items() if meaning == GROUND_TRUTH}
+        yield from self._truths(GROUND_TRUTH, ground_truth.decode)
+
+    def whisker_truth(self) -> Iterator[tuple[int, WhiskerTruth]]:
+        """(log time, what the whiskers really did) ordered by log time; nothing where the recording has none.
+
+        Raises:
+            RecordingError: the file turns out to be damaged.
+        """
+        yield from self._truths(WHISKER_TRUTH, ground_truth.decode_whiskers)
+
+    def _truths(self, meaning: str, decode: Callable[[bytes], T]) -> Iterator[tuple[int, T]]:
+        wanted = {topic for topic, its in self._meanings.items() if its == meaning}
+        (typename,) = MEANINGS[meaning].types
         counters = Counters()
         for raw in self.raw_messages(wanted):
-            if raw.typename != ground_truth.TYPENAME:
-                raise RecordingError(f"{self.path}: {raw.topic} is {raw.typename}, expected {ground_truth.TYPENAME}")
+            if raw.typename != typename:
+                raise RecordingError(f"{self.path}: {raw.topic} is {raw.typename}, expected {typename}")
             try:
-                yield raw.log_time_ns, ground_truth.decode(raw.data)
+                truth = decode(raw.data)
             except MessageError:
                 counters["bad_message"] += 1
+                continue
+            yield raw.log_time_ns, truth
         if counters:
-            log.warning("%s: ground truth dropped: %s", self.path, counters.line())
+            log.warning("%s: %s dropped: %s", self.path, meaning.replace("_", " "), counters.line())
 
     def attachments(self) -> dict[str, bytes]:
         """Name to content; the last of several with the same name."""

@@ -11,15 +11,17 @@ from types import TracebackType
 from mcap.writer import CompressionType, Writer
 
 from drivers import ground_truth, measurement_messages
-from drivers.ground_truth import GroundTruth
+from drivers.ground_truth import GroundTruth, WhiskerTruth
 from drivers.measurement import HallFrame, Measurement
 from drivers.recording_format import (
     GROUND_TRUTH,
+    MEANINGS,
     MESSAGE_ENCODING,
     METADATA_NAME,
     PROFILE,
     SCHEMA_ENCODING,
     SENSOR_PERIOD_KEY,
+    WHISKER_TRUTH,
     RecordingError,
 )
 from drivers.ros_messages import Message, schema_text, serialize
@@ -154,6 +156,11 @@ class RecordingWriter:
         """Write where the robot really is; the log time is the stamp where none is given."""
         log_time = truth.stamp_ns if log_time_ns is None else log_time_ns
         self.write(GROUND_TRUTH, ground_truth.TYPENAME, ground_truth.encode(truth), log_time, truth.stamp_ns)
+
+    def write_whisker_truth(self, truth: WhiskerTruth, log_time_ns: int | None = None) -> None:
+        """Write what the whiskers really did; the log time is the stamp where none is given."""
+        topic, log_time = MEANINGS[WHISKER_TRUTH].topic, truth.stamp_ns if log_time_ns is None else log_time_ns
+        self.write(topic, ground_truth.WHISKERS_TYPENAME, ground_truth.encode_whiskers(truth), log_time, truth.stamp_ns)
 
     def close(self) -> None:
         """Write the rest and the index, and close the file; again is harmless."""

@@ -31,22 +31,44 @@ class CarrierStates:
     R: FloatArray
 
 
+class Carriers:
+    """Motion of an array's mounts; products of many small matrices are done as one of large ones."""
+
+    def __init__(self, layout: WhiskerLayout) -> None:
+        """The mounts of this array."""
+        self._n, self._p_base = layout.count, layout.p_base
+        self._columns = layout.R_base_whisker.transpose(1, 0, 2).reshape(3, 3 * layout.count)
+        self._factor = _right_factor(layout.R_base_whisker).reshape(4 * layout.count, 4).T
+
+    def at(self, base: BaseStates) -> CarrierStates:
+        """Motion of every mount: v + omega x r, a + alpha x r + omega x (omega x r)."""
+        m, n = len(base.R), self._n
+        lever = self._p_base @ base.R.swapaxes(1, 2)
+        spin, change = _cross_matrix(base.omega).swapaxes(1, 2), _cross_matrix(base.alpha).swapaxes(1, 2)
+        swing = lever @ spin
+        R_map_whisker = (base.R.reshape(3 * m, 3) @ self._columns).reshape(m, 3, n, 3).swapaxes(1, 2)
+        pose, velocity, acceleration = np.empty((m, n, 7)), np.empty((m, n, 6)), np.empty((m, n, 6))
+        pose[..., :3] = base.position[:, None, :] + lever
+        pose[..., 3:] = (_quaternion_wxyz(base.R) @ self._factor).reshape(m, n, 4)
+        velocity[..., :3] = base.velocity[:, None, :] + swing
+        acceleration[..., :3] = base.acceleration[:, None, :] + lever @ change + swing @ spin
+        for rate, turning in ((base.omega, velocity), (base.alpha, acceleration)):
+            in_body = (rate[:, None, :] @ base.R)[:, 0, :]
+            turning[..., 3:] = (in_body @ self._columns).reshape(m, n, 3)
+        return CarrierStates(pose, velocity, acceleration, R_map_whisker)
+
+
 def carrier_states(base: BaseStates, layout: WhiskerLayout) -> CarrierStates:
-    """Motion of every whisker's mount: v + omega x r, a + alpha x r + omega x (omega x r)."""
-    lever = np.einsum("mij,nj->mni", base.R, layout.p_base)
-    omega, alpha = base.omega[:, None, :], base.alpha[:, None, :]
-    swing = np.cross(omega, lever)
-    R_map_whisker = np.einsum("mij,njk->mnik", base.R, layout.R_base_whisker)
-    quaternion = np.einsum("nij,mj->mni", _right_factor(layout.R_base_whisker), _quaternion_wxyz(base.R))
-    pose = np.concatenate([base.position[:, None, :] + lever, quaternion], axis=-1)
-    velocity = base.velocity[:, None, :] + swing
-    acceleration = base.acceleration[:, None, :] + np.cross(alpha, lever) + np.cross(omega, swing)
-    return CarrierStates(
-        pose,
-        np.concatenate([velocity, np.einsum("mnji,mj->mni", R_map_whisker, base.omega)], axis=-1),
-        np.concatenate([acceleration, np.einsum("mnji,mj->mni", R_map_whisker, base.alpha)], axis=-1),
-        R_map_whisker,
-    )
+    """Motion of every whisker's mount, once."""
+    return Carriers(layout).at(base)
+
+
+def _cross_matrix(v: FloatArray) -> FloatArray:
+    """Matrices M, shape (m, 3, 3), with M r = v x r, for v of shape (m, 3)."""
+    M = np.zeros((len(v), 3, 3))
+    M[:, 0, 1], M[:, 0, 2], M[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
+    M[:, 1, 0], M[:, 2, 0], M[:, 2, 1] = v[:, 2], -v[:, 1], v[:, 0]
+    return M
 
 
 def _quaternion_wxyz(R: FloatArray) -> FloatArray:

@@ -28,15 +28,23 @@ A recording instead, as fast as it goes; the same with another odometry; and ser
     "--world",
     default="thesis",
     show_default=True,
-    help="World to drive in: thesis, random:SEED, flat, corridor; for the rm3 layout tunnel, mine or mine:SEED:METRES.",
+    help="World to drive in: thesis, random:SEED, flat, corridor, flooded, flooded:SEED; for the rm3 layout tunnel, "
+    "mine or mine:SEED:METRES.",
 )
-@click.option("--scenario", default=1, show_default=True, help="Scenario of the world, 1 to 5.")
+@click.option("--scenario", default=1, show_default=True, help="Scenario of the world, 1 to 5; 0 waits for waypoints.")
 @click.option(
     "--engine",
     type=click.Choice(["physics", "quasi-static"]),
     default="physics",
     show_default=True,
     help="What moves the whiskers: MuJoCo, or geometry alone, which is many times faster.",
+)
+@click.option(
+    "--joint",
+    type=click.Choice(["default", "thesis-literal"]),
+    default="default",
+    show_default=True,
+    help="The whiskers' joints: as the thesis measured them, or with its stiffness read as 5.7 N m/rad.",
 )
 @click.option("--seed", default=1, show_default=True, help="Tolerances, biases, noise and slip of all sensors.")
 @click.option("--odometry-seed", type=int, help="Bias and noise of the ready-made odometry.  [default: 0]")
@@ -102,11 +110,14 @@ A recording instead, as fast as it goes; the same with another odometry; and ser
     default=None,
     help="Write an MCAP recording instead of serving ports.",
 )
+@click.option("--no-whisker-truth", is_flag=True, help="With --record: leave out what the whiskers really did.")
+@click.option("--compact", is_flag=True, help="With --record: pack the file tighter, which takes longer.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per line.")
 def simulate(
     world: str,
     scenario: int,
     engine: str,
+    joint: str,
     seed: int,
     odometry_seed: int | None,
     odometry_grade: str,
@@ -123,6 +134,8 @@ def simulate(
     max_time: float | None,
     wait: float,
     recording: Path | None,
+    no_whisker_truth: bool,
+    compact: bool,
     as_json: bool,
 ) -> None:
     """The simulated robot: drives a scenario and serves its devices on pseudo-terminals.
@@ -137,6 +150,7 @@ def simulate(
     from sim_backend.device_protocols import ProtocolError
     from sim_backend.fault_schedule import FaultFileError
     from sim_backend.recorded_drive import RecordedDriveError, with_other_odometry
+    from sim_backend.recording_progress import progress_bar
     from sim_backend.robot import RobotSettings
     from sim_backend.world import WorldError
 
@@ -149,6 +163,7 @@ def simulate(
         robot=RobotSettings(
             seed=seed,
             odometry_seed=odometry_seed or 0,
+            joint=joint,
             max_time=max_time,
             imu=replace(imus.GRADES[imu], mount_rpy_deg=imu_mount),
             odometry=odometries.GRADES[odometry_grade],
@@ -160,6 +175,8 @@ def simulate(
         listen=listen,
         protocols=protocols,
         faults=faults,
+        whisker_truth=not no_whisker_truth,
+        compact=compact,
     )
 
     def ready(report: simulation.ReadyReport) -> None:
@@ -170,6 +187,9 @@ def simulate(
             click.echo(f"{name:10s} {port}")
         click.echo(f"configuration: {report.configuration}")
         click.echo(f"ground truth:  {report.truth}")
+        if report.duration is None:
+            click.echo(f"waits for waypoints: robominer-slam waypoint X Y HEADING_DEG --out {out}")
+            return
         driven = source_file.name if source_file is not None else f"scenario {scenario}"
         click.echo(f"{driven}: {report.length:.1f} m in {report.duration / rate:.0f} s")
 
@@ -184,7 +204,8 @@ def simulate(
                 click.echo(f"{out}: {source_file} with {samples} odometry samples of seed {odometry_seed}")
             return
         if recording is not None:
-            counts = simulation.record_drive(settings, recording)
+            with progress_bar(f"recording {recording.name}") as on_progress:
+                counts = simulation.record_drive(settings, recording, on_progress)
             if as_json:
                 _print_json({"event": "recorded", "file": recording, "messages": counts})
             else:

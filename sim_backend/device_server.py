@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
+from sim_backend.control_socket import ControlSocket
 from sim_backend.events import Event, TruthEvent
 from sim_backend.serial_devices import EVENT_OF_DEVICE, SerialDevice
 
@@ -58,6 +59,7 @@ class DeviceServer:
         *,
         rate: float = 1.0,
         on_truth: Callable[[TruthEvent, StartTime], None] | None = None,
+        control: ControlSocket | None = None,
     ) -> None:
         """Serve these devices.
 
@@ -66,8 +68,10 @@ class DeviceServer:
             array: rows, columns and sensor period (us) of the whisker array.
             rate: simulated seconds per second.
             on_truth: called for each truth event when its time has come.
+            control: served as well.
         """
         self._devices, self._array, self._rate, self._on_truth = devices, array, rate, on_truth
+        self._control = control
         self._devices_of_event: dict[type[Event], list[SerialDevice]] = {}
         for device in devices.values():
             self._devices_of_event.setdefault(EVENT_OF_DEVICE[device.role], []).append(device)
@@ -178,7 +182,10 @@ class DeviceServer:
         for device in self._devices.values():
             device.advance(now_ns)
         plugged = [device for device in self._devices.values() if device.port.plugged]
-        readable, _, _ = select.select([device.port for device in plugged], [], [], timeout)
+        control = [] if self._control is None else self._control.sockets()
+        readable, _, _ = select.select([*(device.port for device in plugged), *control], [], [], timeout)
+        if self._control is not None:
+            self._control.serve(readable)
         for device in plugged:
             if device.port in readable:
                 device.answer(time.monotonic_ns)

@@ -19,13 +19,17 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class WhiskerEvent:
-    """One frame of the array: fields, shape (rows * cols, 3), mT; valid, shape (rows * cols,); the truth or None."""
+    """One frame of the array: fields, shape (rows * cols, 3), mT; valid, shape (rows * cols,); the truth or None.
+
+    `contact_point` are the truth's contacts in base_link as it was at each sensor's reading, shape (rows * cols, 3), m.
+    """
 
     time_ns: int
     ready_ns: int
     field_mT: FloatArray
     valid: NDArray[np.bool_]
     truth: ArrayReading | None
+    contact_point: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,11 +41,25 @@ class HallDrift:
         self._temperature = 0.0
 
     def apply(self, field_mT: FloatArray, interval: float) -> FloatArray:
-        """Fields of shape (n, 3), mT, `interval` seconds after the last call, as the drifted sensors see them."""
+        """Fields as the drifted sensors see them.
+
+        Args:
+            field_mT: one frame, shape (n, 3), or several in a row, shape (m, n, 3), mT.
+            interval: time from frame to frame, and from the last call's last frame to the first of these, s.
+        """
         s = self.settings
+        frames = field_mT.reshape(-1, *self._offset.shape)
+        # The same draws whether frames come one by one or together.
+        drawn = self._rng.normal(0.0, 1.0, (len(frames), 1 + self._offset.size))
         # Ornstein-Uhlenbeck: wanders, but stays within a few kelvins.
         keep = np.exp(-interval / s.temperature_time)
-        self._temperature = keep * self._temperature + self._rng.normal(0.0, s.temperature * np.sqrt(1.0 - keep**2))
-        self._offset += self._rng.normal(0.0, s.offset_walk * np.sqrt(interval), self._offset.shape)
-        drifted: FloatArray = field_mT * (1.0 + s.strength_per_kelvin * self._temperature) + self._offset
-        return drifted
+        temperature = np.empty(len(frames))
+        for k, step in enumerate(drawn[:, 0] * (s.temperature * np.sqrt(1.0 - keep**2))):
+            self._temperature = keep * self._temperature + step
+            temperature[k] = self._temperature
+        steps = drawn[:, 1:].reshape(frames.shape) * (s.offset_walk * np.sqrt(interval))
+        steps[0] += self._offset
+        offset = steps.cumsum(axis=0)
+        self._offset = offset[-1]
+        drifted: FloatArray = frames * (1.0 + s.strength_per_kelvin * temperature)[:, None, None] + offset
+        return drifted.reshape(field_mT.shape)

@@ -12,8 +12,12 @@ from numpy.typing import NDArray
 from robominer_slam.layout import WhiskerLayout
 from sim_backend import whisker_model
 from sim_backend.base_motion import BaseMotion
-from sim_backend.carriers import carrier_states
-from sim_backend.whisker_model import CARRIER_MASS, GEOM_PREFIX, ContactModel, WhiskerMechanics
+from sim_backend.carriers import Carriers
+from sim_backend.contact_log import CONTACT_STEPS, ContactLog
+from sim_backend.ground_contacts import GroundContacts
+from sim_backend.rod_drag import RodDrag
+from sim_backend.touch_surface import SampledHeight, SmoothHeight
+from sim_backend.whisker_model import CARRIER_MASS, ContactModel, WhiskerMechanics
 from sim_backend.world import World
 
 FloatArray = NDArray[np.float64]
@@ -22,13 +26,9 @@ BoolArray = NDArray[np.bool_]
 #: 400 steps a second: a free whisker's frequency and decrement come out within 5 % of the damped oscillator's
 #: (the implicit integrator adds damping of the order of the step), 16 steps make a frame of 40 ms.
 TIME_STEP = 0.0025
-#: The ground planes are laid anew every 10 ms: a tip has then slid 1.5 mm, on a surface that curves by 1 mm over
+#: Planes and ridges are laid anew every 10 ms: a tip has then slid 1.5 mm, on a surface that curves by 1 mm over
 #: 20 mm.
 GROUND_STEPS = 4
-#: Contacts are looked at every 5 ms: half an interval is a fifteenth of the frame.
-CONTACT_STEPS = 2
-#: Normal force above which a contact counts, N: a thousandth of what bends a whisker by one degree.
-CONTACT_FORCE = 1e-5
 
 
 class PhysicsError(RuntimeError):
@@ -45,7 +45,11 @@ class ArrayReading:
         azimuth: from its x-axis, shape (n,), rad, in (-pi, pi].
         hinge: hinge angles about x and y, shape (n, 2), rad.
         contact: whether ground or an object presses on the rod, shape (n,).
-        depth: of the deepest contact below the true surface at the last step, shape (n,), m; NaN without one.
+        depth: of the deepest contact below the true surface, shape (n,), m; NaN without one.
+        contact_point: where the surface presses on the rod, in the map frame, shape (n, 3), m; of several places
+            the one that is pressed most; NaN without contact.
+        contact_arm: how far along the rod from its joint that is, shape (n,), m, about the rod's length where its
+            end touches; NaN without contact.
     """
 
     time: float
@@ -54,6 +58,8 @@ class ArrayReading:
     hinge: FloatArray
     contact: BoolArray
     depth: FloatArray
+    contact_point: FloatArray
+    contact_arm: FloatArray
 
 
 class Engine(Protocol):
@@ -94,7 +100,7 @@ class PhysicsEngine:
         """Build the model and bring the whiskers down to the ground.
 
         Args:
-            world: ground and objects.
+            world: ground and objects, or floor and walls.
             layout: the array.
             motion: how the body moves; it is run from -settle_time on.
             read_offset: when each sensor is read after the frame's start, shape (n,), s, below frame_interval.
@@ -110,34 +116,43 @@ class PhysicsEngine:
         if read_offset.max() >= frame_interval:
             raise ValueError(f"the last sensor is read {read_offset.max()} s after the first, frames overlap")
         self.layout, self.motion, self._dt = layout, motion, time_step
+        rod = mechanics or WhiskerMechanics()
+        reach = layout.length - rod.radius
+        if world.walls is not None:
+            self._ground = GroundContacts(world.walls, reach)
+        else:
+            quick = SampledHeight(world.ground.height, world.ground.extent)
+            self._ground = GroundContacts(SmoothHeight(world.ground), reach, quick)
         self.model = whisker_model.build(
-            world, layout, mechanics or WhiskerMechanics(), contact or ContactModel(), time_step
+            world, layout, rod, contact or ContactModel(), time_step, parts=self._ground.parts
         )
         self.data = mujoco.MjData(self.model)
         n = layout.count
+        self._carriers = Carriers(layout)
         self._qpos, self._qvel = self.data.qpos.reshape(n, 9), self.data.qvel.reshape(n, 8)
         self._force = self.data.qfrc_applied.reshape(n, 8)
-        self._whisker_of_geom = np.full(self.model.ngeom, -1)
-        for i in range(n):
-            geom = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_GEOM, f"{GEOM_PREFIX}{i}")
-            self._whisker_of_geom[geom] = i
+        self._damping = self.model.dof_damping.reshape(n, 8)
+        self._dry_damping = self._damping[:, 6:].copy()
+        self._water: RodDrag | None = None
+        if world.water is not None:
+            self._water = RodDrag(world.water, layout.length, rod.radius)
+            self.model.dof_armature.reshape(n, 8)[:, 6:] += self._water.added_inertia[:, None]
+            mujoco.mj_setConst(self.model, self.data)
+        self._contacts = ContactLog(self.model, n)
         # Angles at a sensor's reading are interpolated between the two steps around it.
         position = read_offset / time_step
         self._before = np.minimum(position.astype(np.intp), self._steps - 1)
         self._share = position - self._before
-        self._nearest = np.minimum(np.round(position).astype(np.intp), self._steps - 1)
-        self._ground = world.ground
-        self._reach = layout.length - (mechanics or WhiskerMechanics()).radius
+        self._contact_row = np.minimum(np.round(position).astype(np.intp), self._steps - 1) // CONTACT_STEPS
         self._frame = 0
         self._frame_interval = frame_interval
-        self._depth = np.full(n, np.nan)
         settle_steps = round(settle_time / time_step)
         self._run(-settle_steps, settle_steps)
 
     def read(self) -> ArrayReading:
         """Advance by one frame interval; the reading's sensors were read during it."""
         time = self._frame * self._frame_interval
-        hinge, contact = self._run(self._frame * self._steps, self._steps)
+        joint, hinge = self._run(self._frame * self._steps, self._steps)
         self._frame += 1
         each = np.arange(self.layout.count)
         before, after = hinge[self._before, each], hinge[self._before + 1, each]
@@ -145,7 +160,9 @@ class PhysicsEngine:
         direction = rod_direction(angles)
         inclination = np.arctan2(np.hypot(direction[:, 0], direction[:, 1]), direction[:, 2])
         azimuth = np.arctan2(direction[:, 1], direction[:, 0])
-        return ArrayReading(time, inclination, azimuth, angles, contact[self._nearest, each], self._depth.copy())
+        contact, depth, point = self._contacts.at(self._contact_row)
+        arm = np.sqrt(np.square(point - joint[self._contact_row * CONTACT_STEPS, each]).sum(axis=-1))
+        return ArrayReading(time, inclination, azimuth, angles, contact, depth, point, arm)
 
     def tips(self) -> FloatArray:
         """Positions of the rods' ends now, shape (n, 3), m, in the map frame."""
@@ -156,55 +173,44 @@ class PhysicsEngine:
         tips: FloatArray = base.position[0] + p @ base.R[0].T
         return tips
 
-    def _run(self, first: int, count: int) -> tuple[FloatArray, BoolArray]:
+    def _run(self, first: int, count: int) -> tuple[FloatArray, FloatArray]:
         """Do `count` steps from step number `first`.
 
         Returns:
-            Hinge angles at the beginning of each step and at the end of the last, shape (count + 1, n, 2);
-            contact at the beginning of each step, shape (count, n).
+            Positions of the joints at the beginning of each step, shape (count, n, 3), m; hinge angles then and at
+            the end of the last step, shape (count + 1, n, 2), rad.
         """
-        carriers = carrier_states(self.motion.at((first + np.arange(count)) * self._dt), self.layout)
+        carriers = self._carriers.at(self.motion.at((first + np.arange(count)) * self._dt))
         hinge = np.empty((count + 1, self.layout.count, 2))
-        contact = np.zeros((count, self.layout.count), dtype=np.bool_)
+        # The force that moves so heavy a body as wanted lets the rods feel the acceleration during the step.
+        force = CARRIER_MASS * carriers.acceleration
+        self._contacts.clear()
         for k in range(count):
             self._qpos[:, :7] = carriers.pose[k]
             self._qvel[:, :6] = carriers.velocity[k]
-            # The force that moves so heavy a body as wanted lets the rods feel the acceleration during the step.
-            self._force[:, :6] = CARRIER_MASS * carriers.acceleration[k]
+            self._force[:, :6] = force[k]
             hinge[k] = self._qpos[:, 7:]
             if k % GROUND_STEPS == 0:
-                self._place_ground(carriers.pose[k, :, :3], carriers.R[k], hinge[k])
+                direction = np.matmul(carriers.R[k], rod_direction(hinge[k])[:, :, None])[:, :, 0]
+                self._ground.place(carriers.pose[k, :, :3].T, direction.T)
+                self.data.mocap_pos[:] = self._ground.position.reshape(-1, 3)
+                self.data.mocap_quat[:] = self._ground.quaternion.reshape(-1, 4)
+                if self._water is not None:
+                    # The integrator takes damping implicitly: as a force, held for some steps, it would overshoot.
+                    self._force[:, 6:], damping = self._water.on_hinges(
+                        (first + k) * self._dt,
+                        carriers.pose[k, :, :3],
+                        carriers.R[k],
+                        carriers.velocity[k],
+                        hinge[k],
+                        self._qvel[:, 6:],
+                    )
+                    self._damping[:, 6:] = self._dry_damping + damping
             mujoco.mj_step(self.model, self.data)
             if k % CONTACT_STEPS == 0:
-                self._note_contacts(contact[k : k + CONTACT_STEPS])
+                self._contacts.note(self.data)
         hinge[count] = self._qpos[:, 7:]
         warnings = self.data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number
         if warnings or not np.isfinite(hinge[count]).all():
             raise PhysicsError(f"the physics became unstable at {self.data.time:.3f} s of simulated time")
-        return hinge, contact
-
-    def _place_ground(self, p_mount: FloatArray, R_map_whisker: FloatArray, hinge: FloatArray) -> None:
-        """Lay each whisker's ground plane tangent to the ground under the centre of its rounded tip."""
-        direction = np.einsum("nij,nj->ni", R_map_whisker, rod_direction(hinge))
-        under = p_mount + self._reach[:, None] * direction
-        under[:, 2], normal = self._ground.height_and_normal(under[:, 0], under[:, 1])
-        self.data.mocap_pos[:] = under
-        # The shortest turn of the plane's z-axis to the normal; MuJoCo normalises it.
-        self.data.mocap_quat[:, 0] = 1.0 + normal[:, 2]
-        self.data.mocap_quat[:, 1] = -normal[:, 1]
-        self.data.mocap_quat[:, 2] = normal[:, 0]
-
-    def _note_contacts(self, contact: BoolArray) -> None:
-        """Mark whiskers that ground or an object presses on, and how deep; each contact's first row is normal."""
-        found = self.data.contact
-        if not self.data.ncon:
-            return
-        whisker = self._whisker_of_geom[found.geom]
-        outside = (whisker < 0).any(axis=1) & (found.efc_address >= 0)
-        if not outside.any():
-            return
-        who = whisker[outside].max(axis=1)
-        pressed = self.data.efc_force[found.efc_address[outside]] > CONTACT_FORCE
-        contact[:, who[pressed]] = True
-        self._depth[:] = np.nan
-        np.fmax.at(self._depth, who, -found.dist[outside])
+        return carriers.pose[:, :, :3], hinge

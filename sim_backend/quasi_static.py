@@ -22,7 +22,9 @@ from numpy.typing import NDArray
 from robominer_slam.layout import WhiskerLayout
 from sim_backend.base_motion import BaseMotion
 from sim_backend.physics import ArrayReading
+from sim_backend.rod_drag import BentRods
 from sim_backend.touch_surface import Surface
+from sim_backend.water import Water
 from sim_backend.whisker_model import WhiskerMechanics
 
 FloatArray = NDArray[np.float64]
@@ -57,6 +59,7 @@ class QuasiStaticEngine:
         settle_time: float = 3.0,
         mechanics: WhiskerMechanics | None = None,
         friction: float = 0.3,
+        water: Water | None = None,
     ) -> None:
         """Bring the whiskers down to the surface.
 
@@ -69,6 +72,7 @@ class QuasiStaticEngine:
             settle_time: simulated time before the first frame, s.
             mechanics: rods and joints; a free rod sags by its weight against the stiffness.
             friction: Coulomb's coefficient.
+            water: that the rods move through.
         """
         if read_offset.max() >= frame_interval:
             raise ValueError(f"the last sensor is read {read_offset.max()} s after the first, frames overlap")
@@ -80,6 +84,7 @@ class QuasiStaticEngine:
         self._reach = layout.length - rod.radius
         self._reach_squared = self._reach**2
         self._sag = rod.mass * GRAVITY * layout.length / 2.0 / rod.stiffness
+        self._water = None if water is None else BentRods(water, layout.length, rod, frame_interval)
         n = layout.count
         self._touching = np.zeros(n, dtype=np.bool_)
         self._tip = self._mount = self._gradient = np.full((3, n), np.nan)
@@ -121,6 +126,10 @@ class QuasiStaticEngine:
         R = R_base @ self.layout.R_base_whisker
         rest = R[..., 2].copy()
         # A rod that hangs free has turned from its mount's direction towards straight down.
+        if self._water is not None:
+            time = (first + np.arange(frames)[:, None] + self._share[:, 0]) * self._interval
+            velocity = (at_start[1:] - at_start[:-1]) / self._interval
+            rest += self._water.hang(time, mount, velocity, base.omega[:-1], rest)
         rest[..., 2] -= self._sag
         rest /= np.sqrt(np.square(rest).sum(axis=-1, keepdims=True))
         mount_T = np.ascontiguousarray(mount.transpose(0, 2, 1))
@@ -132,15 +141,24 @@ class QuasiStaticEngine:
             self._gap, self._gradient = self._surface.gap(self._tip)
         tips = np.empty((frames, 3, self.layout.count))
         touching = np.empty((frames, self.layout.count), dtype=np.bool_)
-        gaps = np.empty((frames, self.layout.count))
+        gaps, normal = np.empty((frames, self.layout.count)), np.empty((frames, 3, self.layout.count))
         for k in range(frames):
+            self._frame_of_block = k
             self._step(mount_T[k], R[k], hanging[k], blocked[k])
             tips[k], touching[k] = self._tip, self._touching
-            gaps[k] = self._gap / np.sqrt(_dot(self._gradient, self._gradient)) - self._radius
-        self._append(first, mount, R, tips, touching, gaps)
+            steep = np.sqrt(_dot(self._gradient, self._gradient))
+            gaps[k], normal[k] = self._gap / steep - self._radius, self._gradient / steep
+        self._append(first, mount, R, tips, touching, gaps, normal)
 
     def _append(
-        self, first: int, mount: FloatArray, R: FloatArray, tips: FloatArray, touching: BoolArray, gaps: FloatArray
+        self,
+        first: int,
+        mount: FloatArray,
+        R: FloatArray,
+        tips: FloatArray,
+        touching: BoolArray,
+        gaps: FloatArray,
+        normal: FloatArray,
     ) -> None:
         along = tips.transpose(0, 2, 1) - mount
         d = (R.swapaxes(-1, -2) @ along[..., None])[..., 0]
@@ -150,10 +168,14 @@ class QuasiStaticEngine:
         # The direction is Rx(q0) Ry(q1) e_z, as in `physics.rod_direction`.
         hinge = np.stack([np.arctan2(-d[..., 1], d[..., 2]), np.arcsin(np.clip(d[..., 0], -1.0, 1.0))], axis=-1)
         depth = np.where(touching, -gaps, np.nan)
+        point = np.where(touching[..., None], (tips - self._radius * normal).transpose(0, 2, 1), np.nan)
+        arm = np.sqrt(np.square(point - mount).sum(axis=-1))
         ends = mount + along * (self.layout.length / self._reach)[:, None]
         for k in range(len(tips)):
             time = (first + k) * self._interval
-            self._ready.append(ArrayReading(time, inclination[k], azimuth[k], hinge[k], touching[k], depth[k]))
+            self._ready.append(
+                ArrayReading(time, inclination[k], azimuth[k], hinge[k], touching[k], depth[k], point[k], arm[k])
+            )
             self._tips.append(ends[k])
 
     def _step(self, mount: FloatArray, R: FloatArray, hanging: FloatArray, blocked: BoolArray) -> None:
@@ -231,6 +253,8 @@ class QuasiStaticEngine:
             Whether the spring presses the tip onto the surface, shape (n,).
         """
         force, nd = self._force(d, R), _dot(n, d)
+        if self._water is not None:
+            force += self._water.push(self._frame_of_block, d)
         press = _dot(force, n) - _dot(force, d) * nd  # q F.e
         t = np.empty_like(d)
         t[0] = d[1] * n[2] - d[2] * n[1]

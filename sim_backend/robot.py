@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
@@ -12,9 +13,10 @@ from scipy.spatial.transform import Rotation
 from robominer_slam import layout as layouts
 from robominer_slam.layout import WhiskerLayout
 from sim_backend import world as worlds
-from sim_backend.base_motion import BaseMotion
+from sim_backend.base_motion import BaseMotion, BaseStates
 from sim_backend.engines import ENGINES, base_motion_on, build_engine
 from sim_backend.events import EncoderEvent, Event, ImuEvent, OdometryEvent, TruthEvent, WhiskerEvent
+from sim_backend.extendable_path import ExtendablePath
 from sim_backend.hall_drift import DriftSettings, HallDrift
 from sim_backend.imu import Imu, ImuSettings
 from sim_backend.magnet import HallArray
@@ -22,13 +24,15 @@ from sim_backend.odometry import BiasedOdometry, OdometrySettings, mean_body_vel
 from sim_backend.physics import Engine
 from sim_backend.random_streams import stream
 from sim_backend.screws import ScrewEncoders, ScrewSettings
-from sim_backend.waypoints import DriveSettings, WaypointPath
+from sim_backend.waypoints import DriveSettings
 from sim_backend.world import World
 
 FloatArray = NDArray[np.float64]
 NANOSECONDS = 1_000_000_000
-#: Frames for which the other sensors are computed at once: numpy is slow on few samples.
+#: Frames for which the sensors are computed at once: numpy is slow on few samples.
 BLOCK = 25
+#: The same where a frame takes the engine milliseconds: a live robot must not wait for a whole second's frames.
+PHYSICS_BLOCK = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +44,7 @@ class RobotSettings:
         odometry_seed: of the ready-made odometry alone.
         frame_interval_us: time between two whisker frames, us.
         sensor_period_us: time between two sensors of a frame, us.
+        joint: the whiskers' joints, one of `whisker_model.JOINTS`.
         max_time: where to cut the drive short, s; None drives to the end.
         drive, imu, screws, odometry, drift: settings of the parts.
     """
@@ -48,6 +53,7 @@ class RobotSettings:
     odometry_seed: int = 0
     frame_interval_us: int = 40_000
     sensor_period_us: int = 600
+    joint: str = "default"
     max_time: float | None = None
     drive: DriveSettings = field(default_factory=DriveSettings)
     imu: ImuSettings = field(default_factory=ImuSettings)
@@ -66,11 +72,20 @@ class SimulatedRobot:
         motion: BaseMotion,
         engine: Engine,
         settings: RobotSettings,
+        block: int = BLOCK,
+        path: ExtendablePath | None = None,
     ) -> None:
-        """Switch everything on; nothing is simulated before `events` is iterated over."""
+        """Switch everything on; nothing is simulated before `events` is iterated over.
+
+        Args:
+            world, layout, motion, engine: what is driven, by what, and where.
+            settings: rates, seeds and grades.
+            block: frames computed at once.
+            path: that the motion follows, where it may grow.
+        """
         self.world, self.layout, self.motion, self.settings = world, layout, motion, settings
         self.hall = HallArray(layout, settings.seed)
-        self._engine = engine
+        self._engine, self._block, self.path = engine, block, path
         self._hall_noise = stream(settings.seed, "hall")
         self._drift = HallDrift(settings.seed, layout.count, settings.drift)
         self._imu = Imu(settings.seed, settings.imu)
@@ -81,46 +96,75 @@ class SimulatedRobot:
 
     @property
     def duration(self) -> float:
-        """Simulated time from start to end, s."""
+        """Simulated time from start to end, s; infinite while the robot waits for waypoints."""
         limit = self.settings.max_time
         return self.motion.duration if limit is None else min(limit, self.motion.duration)
 
     def events(self) -> Iterator[Event]:
-        """All events, ordered by the time at which they are ready."""
+        """All events, ordered by the time at which they are ready; computed a block of frames ahead."""
         interval = self.settings.frame_interval_us * 1000
-        frames = int(self.duration * NANOSECONDS) // interval
         waiting: list[Event] = []
-        for k in range(frames):
-            start, end = k * interval, (k + 1) * interval
-            if k % BLOCK == 0:
-                block_end = min(k + BLOCK, frames) * interval
-                waiting += self._imu_events(start, block_end)
-                waiting += self._encoder_events(start, block_end)
-                waiting += self._odometry_events(start, block_end)
-            waiting += self._frame(start)
+        first = 0
+        while (last := self._block_end(first)) > first:
+            start, end = first * interval, last * interval
+            waiting += self._frames(first, last)
+            waiting += self._imu_events(start, end)
+            waiting += self._encoder_events(start, end)
+            waiting += self._odometry_events(start, end)
             waiting.sort(key=lambda event: event.ready_ns)
-            # What is ready later than the next frame begins waits for that frame's events.
+            # What is ready later than the next block begins waits for that block's events.
             ready = sum(event.ready_ns < end for event in waiting)
             yield from waiting[:ready]
             waiting = waiting[ready:]
+            first = last
         yield from waiting
 
-    def _frame(self, start_ns: int) -> tuple[TruthEvent, WhiskerEvent]:
-        base = self.motion.at([start_ns / NANOSECONDS])
-        reading = self._engine.read()
-        field = self._drift.apply(self.hall.field(reading.hinge, base.R[0]), self.settings.frame_interval_us * 1e-6)
+    def _block_end(self, first: int) -> int:
+        """Number of the frame before which the block that begins with `first` ends; `first` when all is over."""
+        interval = self.settings.frame_interval_us * 1000
+        while True:
+            last = int(min(self.duration * NANOSECONDS, (first + self._block) * interval)) // interval
+            if last > first or self.path is None:
+                return max(last, first)
+            limit = self.settings.max_time
+            cut_short = limit is not None and limit * NANOSECONDS < (first + 1) * interval
+            # A microsecond more than the frame that is not driven: whatever rounding does, it is over then.
+            if self.path.close(math.inf if cut_short else (first + 1) * interval / NANOSECONDS + 1e-6):
+                return first
+
+    def _frames(self, first: int, last: int) -> list[Event]:
+        """Truth and whiskers of the frames numbered from `first` to before `last`."""
+        stamps = np.arange(first, last + 1) * (self.settings.frame_interval_us * 1000)
+        base = self.motion.at(stamps / NANOSECONDS)
+        readings = [self._engine.read() for _ in stamps[:-1]]
+        field = self.hall.field(np.stack([reading.hinge for reading in readings]), base.R[:-1])
+        field = self._drift.apply(field, self.settings.frame_interval_us * 1e-6)
         field_mT = self.hall.sample(field, self._hall_noise)
-        field_mT[~self.layout.present] = 0.0
-        truth = TruthEvent(
-            start_ns,
-            start_ns,
-            base.position[0],
-            Rotation.from_matrix(base.R[0]).as_quat(),
-            base.R[0].T @ base.velocity[0],
-            base.R[0].T @ base.omega[0],
-        )
-        ready = start_ns + self._frame_time_ns
-        return truth, WhiskerEvent(start_ns, ready, field_mT, self.layout.present, reading)
+        field_mT[:, ~self.layout.present] = 0.0
+        orientation = Rotation.from_matrix(base.R).as_quat()
+        velocity, omega = (np.einsum("mji,mj->mi", base.R, v) for v in (base.velocity, base.omega))
+        contacts = self._in_base(np.stack([reading.contact_point for reading in readings]), base)
+        events: list[Event] = []
+        for k, (start, reading) in enumerate(zip(stamps[:-1].tolist(), readings, strict=True)):
+            events.append(TruthEvent(start, start, base.position[k], orientation[k], velocity[k], omega[k]))
+            ready = start + self._frame_time_ns
+            events.append(WhiskerEvent(start, ready, field_mT[k], self.layout.present, reading, contacts[k]))
+        return events
+
+    def _in_base(self, points: FloatArray, base: BaseStates) -> FloatArray:
+        """Points of m frames, shape (m, n, 3), m, from the map to base_link as it was when each sensor was read.
+
+        Args:
+            points: in the map.
+            base: the body at the starts of these frames and of the next; between, it moves evenly but for
+                micrometres.
+        """
+        offset = np.arange(self.layout.count) * self.settings.sensor_period_us
+        share = (offset / self.settings.frame_interval_us)[:, None]
+        position = base.position[:-1, None] + share * np.diff(base.position, axis=0)[:, None]
+        R = base.R[:-1, None] + share[:, :, None] * np.diff(base.R, axis=0)[:, None]
+        in_base: FloatArray = ((points - position)[..., None, :] @ R)[..., 0, :]
+        return in_base
 
     def _imu_events(self, start_ns: int, end_ns: int) -> list[Event]:
         number, stamps = _samples(start_ns, end_ns, self.settings.imu.rate)
@@ -173,7 +217,7 @@ def build_robot(
     engine: str = "physics",
     settings: RobotSettings | None = None,
 ) -> SimulatedRobot:
-    """The thesis's robot in a world, about to drive a scenario.
+    """The thesis's robot in a world, about to drive a scenario; in scenario 0 it waits for waypoints.
 
     Raises:
         WorldError: no such world or scenario, or the engine cannot do this world.
@@ -187,7 +231,8 @@ def build_robot(
     # More whiskers are read faster, so that a frame ends before the next.
     period = min(chosen.sensor_period_us, chosen.frame_interval_us * 96 // 100 // layout.count)
     chosen = replace(chosen, sensor_period_us=period)
-    motion = base_motion_on(world, WaypointPath(world.scenario(scenario), chosen.drive))
+    path = ExtendablePath(world.scenario(scenario), chosen.drive, waits=scenario == 0)
+    motion = base_motion_on(world, path)
     array = build_engine(
         engine,
         world,
@@ -195,5 +240,7 @@ def build_robot(
         motion,
         read_offset=np.arange(layout.count, dtype=np.float64) * chosen.sensor_period_us * 1e-6,
         interval=chosen.frame_interval_us * 1e-6,
+        joint=chosen.joint,
     )
-    return SimulatedRobot(world, layout, motion, array, chosen)
+    block = PHYSICS_BLOCK if engine == "physics" else BLOCK
+    return SimulatedRobot(world, layout, motion, array, chosen, block, path)

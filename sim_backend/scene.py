@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from sim_backend.ground import HeightField
 from sim_backend.solids import Solid
 from sim_backend.touch_surface import HeightFunction, Surface
+from sim_backend.water import Water
 
 FloatArray = NDArray[np.float64]
 
@@ -37,8 +38,9 @@ class World:
         scenarios: waypoints by scenario number, each of shape (n, 3): x, y in m, heading in rad, unwrapped.
         layout: the array that the world is made for.
         walls: floor and walls of a gallery, where a height field cannot tell them; `ground` is then the floor
-            around the start only. The physics engine knows no walls.
+            around the start only.
         floor: height of the floor everywhere, which the body follows; None where the body is held level.
+        water: what the whiskers move through, with mud above the true surface; None for air.
     """
 
     name: str
@@ -48,9 +50,10 @@ class World:
     layout: str = "thesis-grid"
     walls: Surface | None = None
     floor: HeightFunction | None = None
+    water: Water | None = None
 
     def height(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
-        """Height of the true surface, ground and objects, at (x, y), m, in the map frame."""
+        """Height of the true surface, ground and objects without mud, at (x, y), m."""
         px, py = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
         if self.floor is not None:
             return self.floor(px, py)
@@ -62,12 +65,16 @@ class World:
     def scenario(self, number: int) -> FloatArray:
         """Waypoints of a scenario, shape (n, 3): x, y in m, heading in rad, unwrapped.
 
+        Scenario 0, in every world, is the start alone.
+
         Raises:
             WorldError: the world has no such scenario.
         """
+        if number == 0:
+            return next(iter(self.scenarios.values()))[:1]
         if number not in self.scenarios:
             known = ", ".join(map(str, self.scenarios))
-            raise WorldError(f"world {self.name!r} has no scenario {number}, expected one of {known}")
+            raise WorldError(f"world {self.name!r} has no scenario {number}, expected one of {known}, or 0")
         return self.scenarios[number]
 
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import signal
-import threading
+import contextlib
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import FrameType
 
 import numpy as np
 
@@ -25,16 +23,20 @@ from sim_backend.configuration_writer import (
     framed_port,
     write_calibration,
 )
+from sim_backend.control_socket import ControlSocket
 from sim_backend.device_protocols import parse_protocols
 from sim_backend.device_server import DeviceServer, StartTime
 from sim_backend.events import Event, TruthEvent
-from sim_backend.fault_schedule import FaultSchedule, faults_from_option
+from sim_backend.fault_schedule import FaultFileError, FaultSchedule, faults_from_option
 from sim_backend.recorded_drive import RecordedDriveError, events_of
 from sim_backend.recorder import record
 from sim_backend.robot import RobotSettings, SimulatedRobot, build_robot
 from sim_backend.sensor_faults import SensorFaults
 from sim_backend.serial_devices import EVENT_OF_DEVICE, ClockSettings, SerialDevice, plug_in
+from sim_backend.stop_signals import stop_on_signals
 from sim_backend.truth import TruthFile
+from sim_backend.waypoint_control import WaypointControl
+from sim_backend.world import WorldError
 
 TRUTH = "ground_truth.txt"
 PORTS = "dev"
@@ -58,6 +60,8 @@ class SimulationSettings:
         clocks: clocks of devices that differ from the default.
         protocols: of devices that speak another than `framed`, as `whiskers=rm3-compressed`.
         faults: a file of faults, or `seed:N`; None for a robot without.
+        whisker_truth: whether a recording also says what the whiskers really did.
+        compact: whether a recording is packed as tightly as it goes.
     """
 
     out: Path
@@ -73,16 +77,18 @@ class SimulationSettings:
     clocks: dict[str, ClockSettings] | None = None
     protocols: tuple[str, ...] = ()
     faults: str | None = None
+    whisker_truth: bool = True
+    compact: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class ReadyReport:
-    """What a host needs to know when the devices are plugged in."""
+    """What a host needs to know when the devices are plugged in; no duration where the robot waits for waypoints."""
 
     ports: dict[str, Path]
     configuration: Path
     truth: Path
-    duration: float
+    duration: float | None
     length: float
 
 
@@ -108,9 +114,10 @@ class Drive:
         sensor_period_us: time between two sensors of a frame.
         ticks_per_turn: of the screws' encoders.
         events: starts the drive.
-        duration: s.
+        duration: s; infinite where the robot waits for waypoints.
         length: of the way driven, m.
         faults: what goes wrong.
+        control: answers requests while it is driven; None where nothing can be asked for.
     """
 
     layout: WhiskerLayout
@@ -121,6 +128,7 @@ class Drive:
     duration: float
     length: float
     faults: FaultSchedule = field(default_factory=FaultSchedule)
+    control: WaypointControl | None = None
 
 
 def simulated_drive(settings: SimulationSettings) -> Drive:
@@ -136,6 +144,10 @@ def simulated_drive(settings: SimulationSettings) -> Drive:
     calibration = write_calibration(settings.out.absolute(), layout, settings.robot.seed)
     faults = FaultSchedule()
     if settings.faults is not None:
+        if math.isinf(robot.duration) and settings.faults.startswith("seed:"):
+            raise FaultFileError(
+                f"faults {settings.faults}: scenario 0 has no end to spread them over, give --max-time"
+            )
         faults = faults_from_option(settings.faults, robot.duration, rows=layout.rows, cols=layout.cols)
     rest = robot.hall.field(np.zeros((layout.count, 2)), np.eye(3))
     sensors = SensorFaults(
@@ -150,6 +162,7 @@ def simulated_drive(settings: SimulationSettings) -> Drive:
         robot.duration,
         robot.motion.length,
         faults,
+        None if robot.path is None else WaypointControl(robot.world, robot.path),
     )
 
 
@@ -197,16 +210,21 @@ def serve(settings: SimulationSettings, drive: Drive, on_ready: Callable[[ReadyR
     )
     ports = {name: device.path for name, device in devices.items()}
     (out / CONFIGURATION).write_text(_configuration(settings, drive, out, devices), encoding="utf-8")
-    with TruthFile(out / TRUTH) as truth:
+    with TruthFile(out / TRUTH) as truth, contextlib.ExitStack() as at_end:
+        control = None
+        if drive.control is not None:
+            control = ControlSocket(out, drive.control.answer)
+            at_end.callback(control.close)
 
         def write_truth(event: TruthEvent, start: StartTime) -> None:
             truth.write(event, start.unix(event.time_ns))
 
         array = (drive.layout.rows, drive.layout.cols, drive.sensor_period_us)
-        server = DeviceServer(devices, array, rate=settings.rate, on_truth=write_truth)
+        server = DeviceServer(devices, array, rate=settings.rate, on_truth=write_truth, control=control)
         try:
-            with _stop_on_signals(server.stop) as stopped:
-                on_ready(ReadyReport(ports, out / CONFIGURATION, out / TRUTH, drive.duration, drive.length))
+            with stop_on_signals(server.stop) as stopped:
+                duration = None if math.isinf(drive.duration) else drive.duration
+                on_ready(ReadyReport(ports, out / CONFIGURATION, out / TRUTH, duration, drive.length))
                 # A daemon opens the ports of its configuration only: it need not ping the others.
                 host_came = server.wait_for_host(settings.wait, USED_BY_SOURCE[settings.source])
                 begin = time.monotonic()
@@ -232,12 +250,14 @@ def record_drive(
     Calls `on_progress` with the share of the drive that is done.
 
     Raises:
-        WorldError: no such world or scenario.
+        WorldError: no such world or scenario, or it has no end.
         RecordingError: the recording cannot be written.
         OSError: a file cannot be made.
     """
     out = settings.out.absolute()
     drive = simulated_drive(settings)
+    if math.isinf(drive.duration):
+        raise WorldError("scenario 0 has no end: give --max-time to record it")
     (out / CONFIGURATION).write_text(_configuration(settings, drive, out), encoding="utf-8")
     duration_ns = 1e9 * drive.duration
     return record(
@@ -257,6 +277,8 @@ def record_drive(
             "seed": str(settings.robot.seed),
             "odometry_seed": str(settings.robot.odometry_seed),
         },
+        whisker_truth=settings.whisker_truth,
+        compact=settings.compact,
         on_progress=None if on_progress is None else lambda time_ns: on_progress(time_ns / duration_ns),
     )
 
@@ -284,23 +306,3 @@ def _configuration(
         store=folder / STORE,
         listen=settings.listen,
     )
-
-
-@contextmanager
-def _stop_on_signals(stop: Callable[[], None]) -> Iterator[threading.Event]:
-    """Let SIGTERM and SIGINT end the drive cleanly; yields whether one came. Only the main thread has signals."""
-    came = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield came
-        return
-
-    def handle(_number: int, _frame: FrameType | None) -> None:
-        came.set()
-        stop()
-
-    before = {number: signal.signal(number, handle) for number in (signal.SIGTERM, signal.SIGINT)}
-    try:
-        yield came
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

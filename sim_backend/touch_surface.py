@@ -1,4 +1,4 @@
-"""The surface that tips lie on, as a function whose zero it is: fast enough to be asked for every frame."""
+"""The surface that rods lie on, as a function whose zero it is: fast enough to be asked for every frame."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sim_backend.ground import HeightField
 
 FloatArray = NDArray[np.float64]
 
@@ -20,11 +22,38 @@ Extent = tuple[tuple[float, float], tuple[float, float]]
 SAMPLING = 0.005
 
 
-class Surface(Protocol):
-    """What a rod's end can touch: positive in the open, zero on the surface, negative inside."""
+#: A part's value at points and its gradient there.
+Part = tuple[FloatArray, FloatArray]
 
-    def gap(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
+
+class Surface(Protocol):
+    """What a rod can touch: positive in the open, zero on the surface, negative inside."""
+
+    def gap(self, p: FloatArray) -> Part:
         """Value at points of shape (3, n), m, shape (n,), and its gradient there, shape (3, n), not normalised."""
+
+    def parts(self, p: FloatArray) -> tuple[Part, ...]:
+        """The same of each smooth part, such as floor and wall, always in the same order; `gap` is the smallest.
+
+        Between two parts may be a corner in which a rod's end touches both.
+        """
+
+
+class SmoothHeight:
+    """The ground alone, without objects, exactly as the height field has it: its value is the distance near it."""
+
+    def __init__(self, ground: HeightField) -> None:
+        """The surface of this ground."""
+        self._ground = ground
+
+    def gap(self, p: FloatArray) -> Part:
+        """See `Surface.gap`."""
+        height, normal = self._ground.height_and_normal(p[0], p[1])
+        return (p[2] - height) * normal[:, 2], normal.T
+
+    def parts(self, p: FloatArray) -> tuple[Part, ...]:
+        """See `Surface.parts`."""
+        return (self.gap(p),)
 
 
 class SampledHeight:
@@ -43,7 +72,11 @@ class SampledHeight:
         twist = z[1:, 1:] - z[1:, :-1] - dx
         self._table = np.stack([z[:-1, :-1], dx, dy, twist], axis=-1).reshape(-1, 4)
 
-    def gap(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def parts(self, p: FloatArray) -> tuple[Part, ...]:
+        """See `Surface.parts`."""
+        return (self.gap(p),)
+
+    def gap(self, p: FloatArray) -> Part:
         """See `Surface.gap`."""
         place = (p[:2] - self._start) * self._scale
         np.minimum(np.maximum(place, 0.0, out=place), self._last, out=place)

@@ -66,16 +66,9 @@ class WaypointPath:
         self.settings = settings or DriveSettings()
         self.waypoints = np.asarray(waypoints, dtype=np.float64).reshape(-1, 3)
         self._step = np.diff(self.waypoints, axis=0)
-        full = np.maximum(
-            np.hypot(self._step[:, 0], self._step[:, 1]) / self.settings.speed,
-            np.abs(self._step[:, 2]) / self.settings.turn_rate,
-        )
-        ramp = self.settings.ramp
-        #: Cruising rate of the share, 1/s. A leg of no length takes no time.
-        self._rate = np.divide(1.0, np.maximum(full, ramp), where=full > 0.0, out=np.zeros_like(full))
-        leg_time = np.where(full > 0.0, np.maximum(full, ramp) + ramp, 0.0)
-        self._start = self.settings.rest_before + np.concatenate([[0.0], np.cumsum(leg_time)])
-        self._leg_time = leg_time
+        self._rate, self._leg_time = self._timing(self._step)
+        #: When each leg starts, and when the last one ends, s; between two legs there may be a rest.
+        self._start = self.settings.rest_before + np.concatenate([[0.0], np.cumsum(self._leg_time)])
 
     @property
     def duration(self) -> float:
@@ -97,6 +90,15 @@ class WaypointPath:
         share, rate, change = self._progress(t - self._start[leg], leg)
         step = self._step[leg]
         return Motion(self.waypoints[leg] + share[:, None] * step, rate[:, None] * step, change[:, None] * step)
+
+    def _timing(self, step: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Cruising rate of the share, 1/s, and duration, s, of legs of shape (m, 3); no length takes no time."""
+        full = np.maximum(
+            np.hypot(step[:, 0], step[:, 1]) / self.settings.speed, np.abs(step[:, 2]) / self.settings.turn_rate
+        )
+        ramp = self.settings.ramp
+        rate = np.divide(1.0, np.maximum(full, ramp), where=full > 0.0, out=np.zeros_like(full))
+        return rate, np.where(full > 0.0, np.maximum(full, ramp) + ramp, 0.0)
 
     def _progress(self, t: FloatArray, leg: NDArray[np.intp]) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Share of the leg that is behind, its rate and the rate's change, at times since the leg's start."""

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from robominer_slam import layout
 from sim_backend.jig import COLUMNS, jig_sweep, to_csv
-from sim_backend.magnet import EARTH_MT, HallArray, MagnetGeometry, Tolerances
+from sim_backend.magnet import EARTH_MT, HallArray, MagnetGeometry, Tolerances, rod_rotation
 from sim_backend.physics import hinge_angles
 
 NONE = Tolerances(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -35,7 +35,7 @@ def test_far_from_a_small_magnet_the_field_is_a_dipoles():
     moment = geometry.polarization / mu_0 * np.pi * 0.0005**2 * 0.001
     r = np.array([0, 0, -geometry.arm - geometry.gap]) - R.apply([0, 0, -geometry.arm])
     expected = 1e3 * dipole(moment * R.apply([0, 0, 1]), r)
-    np.testing.assert_allclose(array._own_field(Rotation.from_euler("XY", held_at(0.6, 0.8)))[7], expected, rtol=2e-3)
+    np.testing.assert_allclose(array._own_field(rod_rotation(held_at(0.6, 0.8)))[7], expected, rtol=2e-3)
 
 
 def test_a_tilt_at_rest_shows_as_02_to_04_degrees_per_step():
@@ -60,7 +60,7 @@ def test_fields_stay_in_range_and_unfolded():
 def test_neighbours_and_earth_are_small_but_there():
     array = HallArray(GRID, 1, tolerances=NONE)
     field = array.field(np.zeros((64, 2)), np.eye(3))
-    own = array._own_field(Rotation.from_euler("XY", np.zeros((64, 2))))
+    own = array._own_field(rod_rotation(np.zeros((64, 2))))
     neighbours = field - own - EARTH_MT * [1, -1, -1]
     assert 0.01 < np.linalg.norm(neighbours, axis=1).max() < 1.0
     # Whisker 0's neighbours at rest, one dipole after the other.
