@@ -9,7 +9,7 @@ from pathlib import Path
 import tomlkit
 
 from calibration.file_format import to_text
-from calibration.fit import JigSamples, fit_jig
+from calibration.fit import JigSamples, fit_array
 from robominer_slam.layout import WhiskerLayout
 from sim_backend.jig import jig_sweep, to_csv
 
@@ -100,7 +100,7 @@ def write_calibration(folder: Path, layout: WhiskerLayout, seed: int) -> str:
     """
     rows = jig_sweep(layout, seed)
     (folder / JIG_TABLE).write_text(to_csv(rows), encoding="utf-8")
-    report = fit_jig(JigSamples.from_rows(rows.tolist()), layout.rows, layout.cols)
+    report = fit_array([JigSamples.from_rows(rows.tolist())], layout)
     text = to_text(
         report,
         array_id=f"sim-{seed}",

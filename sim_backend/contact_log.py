@@ -11,7 +11,7 @@ from sim_backend.whisker_model import GEOM_PREFIX
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-#: Contacts are looked at every 5 ms: half an interval is a fifteenth of the frame.
+#: Contacts are looked at every 8 ms: half an interval is a tenth of the frame.
 CONTACT_STEPS = 2
 #: Normal force above which a contact counts, N: a thousandth of what bends a whisker by one degree.
 CONTACT_FORCE = 1e-5

@@ -18,8 +18,6 @@ from sim_backend.touch_surface import Surface
 
 FloatArray = NDArray[np.float64]
 
-#: Ridges are laid anew every other time: it costs as much as all the rest.
-RIDGE_TURN = 2
 #: Radius of a ridge, m. Wide enough that the slope under a rod that slides over it is right until it is laid anew
 #: (3 mm: 8 deg), narrow enough to lie below the surface everywhere but at edges sharper than this.
 RIDGE_RADIUS = 0.02
@@ -55,7 +53,6 @@ class GroundContacts:
         self._surface, self._quick, self._reach = surface, quick or surface, reach
         self._along = PLACES[:-1, None] * reach
         self._each = np.arange(n)
-        self._turn = -1
         self.position = np.full((self.parts + 1, n, 3), -10.0)
         self.quaternion = np.tile([1.0, 0.0, 0.0, 0.0], (self.parts + 1, n, 1))
 
@@ -74,9 +71,6 @@ class GroundContacts:
             turn[:, 0] = 1.0 + normal[2]
             turn[:, 1] = -normal[1]
             turn[:, 2] = normal[0] + 1e-12
-        self._turn = (self._turn + 1) % RIDGE_TURN
-        if self._turn:
-            return
         p = joint[:, None, :] + self._along * direction[:, None, :]
         gap, gradient = self._quick.gap(p.reshape(3, -1))
         clearance = np.empty((len(PLACES), len(nearest)))

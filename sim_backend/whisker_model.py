@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from robominer_slam.layout import WhiskerLayout
@@ -49,18 +50,23 @@ class WhiskerMechanics:
         return 2.0 * self.damping_ratio * float(np.sqrt(self.inertia(length) * self.stiffness))
 
     def stepped_damping(self, length: float, time_step: float) -> float:
-        """Damping with which a free overdamped rod creeps back as it should in spite of the time step, N m s/rad.
+        """Damping with which a free rod swings out, or creeps back, as it should in spite of the time step, N m s/rad.
 
         The integrator takes damping at the step's end and the spring at its beginning: a free hinge then follows
-        I (z - 1)^2 + h c (z - 1) z + h^2 k z = 0 per step h. This is the c for which the slow one of the two
-        continuous poles, z = exp(s h), solves it. Where a rod swings, the damping itself.
+        I (z - 1)^2 + h c (z - 1) z + h^2 k z = 0 per step h. Where a rod swings, this is the c for which the poles'
+        decrement is right; where it is overdamped, that for which the slow pole, z = exp(s h), is.
         """
-        inertia, damping = self.inertia(length), self.damping(length)
+        inertia, damping, h = self.inertia(length), self.damping(length), time_step
         square = damping**2 - 4.0 * inertia * self.stiffness
-        if square <= 0.0:
-            return damping
-        z = float(np.exp((np.sqrt(square) - damping) / (2.0 * inertia) * time_step))
-        return inertia * (1.0 - z) / (time_step * z) + time_step * self.stiffness / (1.0 - z)
+        if square >= 0.0:
+            z = float(np.exp((np.sqrt(square) - damping) / (2.0 * inertia) * h))
+            return inertia * (1.0 - z) / (h * z) + h * self.stiffness / (1.0 - z)
+
+        def decrement_error(c: float) -> float:
+            z = np.roots([inertia + h * c, h**2 * self.stiffness - h * c - 2.0 * inertia, inertia])[0]
+            return float(np.log(abs(z)) / abs(np.angle(z))) + damping / float(np.sqrt(-square))
+
+        return float(brentq(decrement_error, 0.5 * damping, 2.0 * damping))
 
 
 #: The joint as the thesis entered it into its simulator, 5.7 N m/rad and 0.1 N m s/rad: a free rod is overdamped and
@@ -157,7 +163,7 @@ def build(
     model = mujoco.MjModel.from_xml_string(
         f"""<mujoco model="{world.name}">
         <option timestep="{time_step}" integrator="implicitfast" solver="CG" cone="elliptic" jacobian="sparse"
-          impratio="{contact.cone_ratio}" tolerance="1e-8"/>
+          impratio="{contact.cone_ratio}" tolerance="1e-6"/>
         <size memory="64M"/>
         <visual><global offwidth="1600" offheight="900"/></visual>
         <default><geom solref="{solref}"/></default>

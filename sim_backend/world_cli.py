@@ -15,7 +15,7 @@ EPILOG = """
 Example: what the mine is; a picture of the robot in it; an animation of a whole scenario:
   robominer-slam world mine
   robominer-slam world mine --at 60 --picture mine.png
-  robominer-slam world thesis --scenario 4 --picture scenario4.gif
+  robominer-slam world thesis --scenario 4 --picture scenario4.webp
 """
 
 
@@ -26,7 +26,7 @@ Example: what the mine is; a picture of the robot in it; an animation of a whole
               help="What moves the whiskers in the picture.")  # fmt: skip
 @click.option("--at", default=15.0, show_default=True, help="Time of the picture in the scenario, s.")
 @click.option("--picture", type=click.Path(dir_okay=False, path_type=Path),
-              help="Write the robot in the world: FILE.png, or FILE.gif for the whole scenario.")  # fmt: skip
+              help="Write the robot in the world: FILE.png, FILE.webp or .gif for the whole scenario.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the figures as JSON.")
 def world(name: str, scenario: int, engine: str, at: float, picture: Path | None, as_json: bool) -> None:
     """Show a world of the simulated robot: its layout, size and scenarios; with --picture, how it looks."""
@@ -49,8 +49,8 @@ def world(name: str, scenario: int, engine: str, at: float, picture: Path | None
         }
         if picture is not None:
             duration = paths[scenario].duration if scenario in paths else 0.0
-            if picture.suffix not in (".png", ".gif"):
-                raise click.UsageError(f"--picture {picture}: expected a file that ends in .png or .gif")
+            if picture.suffix not in (".png", ".gif", ".webp"):
+                raise click.UsageError(f"--picture {picture}: expected a file that ends in .png, .webp or .gif")
             if scenario in paths and not 0.0 <= at <= duration:
                 raise click.UsageError(f"--at {at:g}: scenario {scenario} lasts from 0 to {duration:.0f} s")
             if picture.suffix == ".png":

@@ -14,7 +14,7 @@ from sim_backend import world
 from sim_backend.base_motion import LevelGrid
 from sim_backend.engines import ENGINES, base_motion_on, build_engine
 from sim_backend.ground import HeightField
-from sim_backend.physics import PhysicsEngine
+from sim_backend.physics import TIME_STEP, PhysicsEngine
 from sim_backend.robot import RobotSettings
 from sim_backend.rod_drag import RodDrag
 from sim_backend.scene import World
@@ -75,7 +75,7 @@ def swing_of(water):
     """How far rods that are let go at 0.3 rad overshoot, rad."""
     scene = deep(water)
     motion = LevelGrid(WaypointPath(scene.scenario(1)))
-    engine = PhysicsEngine(scene, GRID, motion, read_offset=AT_ONCE, frame_interval=0.0025, settle_time=0.0)
+    engine = PhysicsEngine(scene, GRID, motion, read_offset=AT_ONCE, frame_interval=TIME_STEP, settle_time=0.0)
     engine._qpos[:, 8] = 0.3
     angle = np.array([engine.read().hinge[:, 1] for _ in range(200)])
     return -angle.min()

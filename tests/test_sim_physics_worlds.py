@@ -12,7 +12,7 @@ from sim_backend.base_motion import LevelGrid, TouchDown
 from sim_backend.engines import base_motion_on, build_engine
 from sim_backend.ground import HeightField
 from sim_backend.ground_contacts import GroundContacts
-from sim_backend.physics import PhysicsEngine, rod_direction
+from sim_backend.physics import TIME_STEP, PhysicsEngine, rod_direction
 from sim_backend.robot import RobotSettings, build_robot
 from sim_backend.sinking import depth_along_rods
 from sim_backend.waypoints import WaypointPath
@@ -195,14 +195,14 @@ def test_the_thesis_literal_joint_creeps_back_with_its_time_constant():
         layouts.thesis_grid(),
         LevelGrid(WaypointPath([[0.0, 0.0, 0.0]]), TouchDown(height=0.0, run_up=0.0)),
         read_offset=np.zeros(64),
-        frame_interval=0.0025,
+        frame_interval=TIME_STEP,
         settle_time=0.0,
         mechanics=THESIS_LITERAL,
     )
     engine._qpos[5, 7] = 0.1
     angle = np.array([engine.read().hinge[5, 0] for _ in range(40)])
     assert (angle > 0.0).all()  # no oscillation
-    fitted = -0.0025 / np.polyfit(np.arange(10, 30), np.log(angle[10:30]), 1)[0]
+    fitted = -TIME_STEP / np.polyfit(np.arange(10, 30), np.log(angle[10:30]), 1)[0]
     assert fitted == pytest.approx(0.1 / 5.7, rel=0.05)
 
 
