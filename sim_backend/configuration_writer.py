@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import tomlkit
+from scipy.spatial.transform import Rotation
 
 from calibration.file_format import to_text
 from calibration.fit import JigSamples, fit_array
@@ -69,10 +70,10 @@ def configuration_text(
         device.update(port.keys)
         if name == "whiskers":
             device["calibration"] = CALIBRATION
-        if name == "screws":
+        if name == "screws" and port.keys["protocol"] == "framed":
             device["ticks_per_turn"] = ticks_per_turn
         if name == "imu" and any(mount_rpy_deg):
-            device["mount_rpy_deg"] = list(mount_rpy_deg)
+            device["mount_rpy_deg"] = _mount_of_device(mount_rpy_deg, str(port.keys["protocol"]))
         devices.append(device)
     document["device"] = devices
     document["estimation"] = {"source": source}
@@ -81,6 +82,15 @@ def configuration_text(
     document["store"] = {"path": str(store)}
     document["zenoh"] = {"listen": [listen], "connect": []}
     return tomlkit.dumps(document)
+
+
+def _mount_of_device(mount_rpy_deg: tuple[float, float, float], protocol: str) -> list[float]:
+    """Roll, pitch, yaw, deg, of the axes in which a device speaks: a MicroStrain's z points down (interfaces, 1.5)."""
+    roll, pitch, yaw = mount_rpy_deg
+    mount = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True)
+    if protocol == "mip":
+        mount = mount * Rotation.from_euler("X", 180.0, degrees=True)
+    return [round(float(angle), 9) for angle in mount.as_euler("ZYX", degrees=True)[::-1]]
 
 
 #: Devices that each source of odometry needs.

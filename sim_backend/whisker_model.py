@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from robominer_slam.layout import WhiskerLayout
@@ -49,24 +48,23 @@ class WhiskerMechanics:
             return self.hinge_damping
         return 2.0 * self.damping_ratio * float(np.sqrt(self.inertia(length) * self.stiffness))
 
-    def stepped_damping(self, length: float, time_step: float) -> float:
-        """Damping with which a free rod swings out, or creeps back, as it should in spite of the time step, N m s/rad.
+    def stepped(self, length: float, time_step: float) -> tuple[float, float]:
+        """Inertia (kg m2) and damping (N m s/rad) with which a free rod moves as it should in spite of the time step.
 
         The integrator takes damping at the step's end and the spring at its beginning: a free hinge then follows
-        I (z - 1)^2 + h c (z - 1) z + h^2 k z = 0 per step h. Where a rod swings, this is the c for which the poles'
-        decrement is right; where it is overdamped, that for which the slow pole, z = exp(s h), is.
+        I (z - 1)^2 + h c (z - 1) z + h^2 k z = 0 per step h. Where the rod swings, these are the I and c that have the
+        poles z = exp(s h) of the true swing: frequency and decrement are right, and so is the static deflection, as
+        k is kept. An overdamped rod's fast pole would ask for no inertia at all: c alone makes its slow pole right.
         """
-        inertia, damping, h = self.inertia(length), self.damping(length), time_step
-        square = damping**2 - 4.0 * inertia * self.stiffness
+        inertia, damping, h, k = self.inertia(length), self.damping(length), time_step, self.stiffness
+        square = damping**2 - 4.0 * inertia * k
         if square >= 0.0:
             z = float(np.exp((np.sqrt(square) - damping) / (2.0 * inertia) * h))
-            return inertia * (1.0 - z) / (h * z) + h * self.stiffness / (1.0 - z)
-
-        def decrement_error(c: float) -> float:
-            z = np.roots([inertia + h * c, h**2 * self.stiffness - h * c - 2.0 * inertia, inertia])[0]
-            return float(np.log(abs(z)) / abs(np.angle(z))) + damping / float(np.sqrt(-square))
-
-        return float(brentq(decrement_error, 0.5 * damping, 2.0 * damping))
+            return inertia, inertia * (1.0 - z) / (h * z) + h * k / (1.0 - z)
+        pole = np.exp(complex(-damping, np.sqrt(-square)) / (2.0 * inertia) * h)
+        total = h**2 * k / float(abs(1.0 - pole)) ** 2  # I + h c
+        stepped_inertia = float(abs(pole)) ** 2 * total
+        return stepped_inertia, (total - stepped_inertia) / h
 
 
 #: The joint as the thesis entered it into its simulator, 5.7 N m/rad and 0.1 N m s/rad: a free rod is overdamped and
@@ -191,10 +189,11 @@ def _solids(world: World) -> list[str]:
 def _whisker(i: int, layout: WhiskerLayout, mechanics: WhiskerMechanics, time_step: float) -> str:
     """One rod: whiskers touch each other without friction, ground and objects only through the explicit pairs."""
     length = float(layout.length[i])
-    damping = mechanics.stepped_damping(length, time_step)
+    inertia, damping = mechanics.stepped(length, time_step)
     hinge = f'type="hinge" stiffness="{mechanics.stiffness}" damping="{damping}"'
     quat = np.roll(Rotation.from_matrix(layout.R_base_whisker[i]).as_quat(), 1)
-    across, along = mechanics.mass * length**2 / 12.0, mechanics.mass * mechanics.radius**2 / 2.0
+    # About the middle of the rod, by Steiner.
+    across, along = inertia - mechanics.mass * length**2 / 4.0, mechanics.mass * mechanics.radius**2 / 2.0
     carrier = f'mass="{CARRIER_MASS}" diaginertia="{CARRIER_MASS} {CARRIER_MASS} {CARRIER_MASS}"'
     mask = int(layout.present[i])
     return (
