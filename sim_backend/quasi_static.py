@@ -141,14 +141,13 @@ class QuasiStaticEngine:
             self._gap, self._gradient = self._surface.gap(self._tip)
         tips = np.empty((frames, 3, self.layout.count))
         touching = np.empty((frames, self.layout.count), dtype=np.bool_)
-        gaps, normal = np.empty((frames, self.layout.count)), np.empty((frames, 3, self.layout.count))
+        gaps, gradient = np.empty((frames, self.layout.count)), np.empty((frames, 3, self.layout.count))
         for k in range(frames):
             self._frame_of_block = k
             self._step(mount_T[k], R[k], hanging[k], blocked[k])
             tips[k], touching[k] = self._tip, self._touching
-            steep = np.sqrt(_dot(self._gradient, self._gradient))
-            gaps[k], normal[k] = self._gap / steep - self._radius, self._gradient / steep
-        self._append(first, mount, R, tips, touching, gaps, normal)
+            gaps[k], gradient[k] = self._gap, self._gradient
+        self._append(first, mount, R, tips, touching, gaps, gradient)
 
     def _append(
         self,
@@ -158,8 +157,10 @@ class QuasiStaticEngine:
         tips: FloatArray,
         touching: BoolArray,
         gaps: FloatArray,
-        normal: FloatArray,
+        gradient: FloatArray,
     ) -> None:
+        steep = np.sqrt(np.square(gradient).sum(axis=1))
+        normal = gradient / steep[:, None]
         along = tips.transpose(0, 2, 1) - mount
         d = (R.swapaxes(-1, -2) @ along[..., None])[..., 0]
         d /= np.sqrt(np.square(d).sum(axis=-1, keepdims=True))
@@ -167,7 +168,7 @@ class QuasiStaticEngine:
         azimuth = np.arctan2(d[..., 1], d[..., 0])
         # The direction is Rx(q0) Ry(q1) e_z, as in `physics.rod_direction`.
         hinge = np.stack([np.arctan2(-d[..., 1], d[..., 2]), np.arcsin(np.clip(d[..., 0], -1.0, 1.0))], axis=-1)
-        depth = np.where(touching, -gaps, np.nan)
+        depth = np.where(touching, self._radius - gaps / steep, np.nan)
         point = np.where(touching[..., None], (tips - self._radius * normal).transpose(0, 2, 1), np.nan)
         arm = np.sqrt(np.square(point - mount).sum(axis=-1))
         ends = mount + along * (self.layout.length / self._reach)[:, None]
