@@ -80,17 +80,30 @@ def angles_from_tilt(tilt: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.hypot(tilt[..., 0], tilt[..., 1]), np.arctan2(tilt[..., 1], tilt[..., 0])
 
 
+def sigma_basis(inclination: FloatArray) -> FloatArray:
+    """1, phi^2, phi^4, shape (..., 3): the variance of the rod's direction is a sum of these."""
+    square = np.square(inclination)
+    return np.stack([np.ones_like(square), square, square * square], axis=-1)
+
+
 @dataclass(frozen=True, slots=True)
 class PolynomialModel:
-    """Polynomials of n whiskers.
+    """Polynomials of n whiskers: what a fit of whichever model is compiled to.
 
     Attributes:
         degree: total degree.
-        rest_mT: field at rest, shape (n, 3), mT.
+        rest_mT: field at rest, shape (n, 3), mT; of length 1 where only directions are sent.
         coefficients: shape (n, terms, 2), rad.
-        sigma: one-sigma error of the rod's direction, shape (n,), rad.
+        sigma: one-sigma error of the rod's direction over all inclinations, shape (n,), rad.
         max_inclination: largest inclination that the fit has seen, shape (n,), rad.
         fitted: False where this whisker has no calibration, shape (n,).
+        variance: coefficients of the variance of a single reading over `sigma_basis`, shape (n, 3), rad2; None
+            takes `sigma` everywhere.
+        neighbours: change of the field at the sensors with the change of the rods' directions in whisker axes from
+            rest, shape (3 n, 3 n), mT; None leaves them out.
+        base_to_sensor: field in base_link's axes to readings, shape (n, 3, 3), for Earth's field; None leaves it out.
+        representation: `Cartesian` (mT) or `Direction` (unit vectors: a firmware that sends two angles only).
+        folded: readings are negated where Bz < 0.
     """
 
     degree: int
@@ -99,10 +112,51 @@ class PolynomialModel:
     sigma: FloatArray
     max_inclination: FloatArray
     fitted: NDArray[np.bool_]
+    variance: FloatArray | None = None
+    neighbours: FloatArray | None = None
+    base_to_sensor: FloatArray | None = None
+    representation: str = "Cartesian"
+    folded: bool = False
 
     def tilt(self, field_mT: FloatArray) -> FloatArray:
         """Tilt vectors, shape (n, 2), rad, of one field reading per whisker, shape (n, 3), mT."""
-        u = dipole_coordinates(field_mT, self.rest_mT)
-        features = monomials(u, self.degree)
-        tilt: FloatArray = np.matmul(features[:, None, :], self.coefficients)[:, 0, :]
+        return PolynomialEvaluator(self).tilt(field_mT).T
+
+
+class PolynomialEvaluator:
+    """A model made ready for one reading after the other: few numpy calls, arrays laid out whisker last."""
+
+    def __init__(self, model: PolynomialModel) -> None:
+        """Lay out the model's coefficients."""
+        n = len(model.rest_mT)
+        self._degree = model.degree
+        self._polarity = np.where(model.rest_mT[:, 2] < 0.0, -1.0, 1.0)
+        strength = np.maximum(np.sqrt(np.square(model.rest_mT).sum(axis=-1)), 1.0)
+        self._inverse_strength = 1.0 / strength
+        self._coefficients = np.ascontiguousarray(model.coefficients.transpose(2, 1, 0))
+        terms = model.coefficients.shape[1]
+        self._features = np.ones((terms, n))
+        # Monomials that begin with x, y, z are x, y, z times those of one degree less that begin with it or later.
+        self._steps: list[tuple[slice, slice, int]] = []
+        start, size = 0, 1
+        for degree in range(1, model.degree + 1):
+            end = write = start + size
+            for variable, count in enumerate((size, degree, 1)):
+                self._steps.append((slice(end - count, end), slice(write, write + count), variable))
+                write += count
+            start, size = end, write - end
+
+    def tilt(self, field_mT: FloatArray) -> FloatArray:
+        """Tilt vectors, shape (2, n), rad, of one field reading per whisker, shape (n, 3), mT."""
+        u = field_mT.T * self._polarity
+        square = u * u
+        transverse_square = square[0] + square[1]
+        strength = np.sqrt(transverse_square + square[2])
+        transverse = np.sqrt(np.maximum(transverse_square, 1e-18))
+        u[:2] *= np.arctan2(2.0 * transverse, u[2]) / transverse
+        u[2] = strength * self._inverse_strength - 1.0
+        features = self._features
+        for source, target, variable in self._steps:
+            np.multiply(features[source], u[variable], out=features[target])
+        tilt: FloatArray = np.einsum("otn,tn->on", self._coefficients, features)
         return tilt

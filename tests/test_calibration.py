@@ -113,7 +113,7 @@ def test_an_edited_or_foreign_file_is_refused_with_one_line(report: FitReport):
         (json.dumps(edited), "hash"),
         ("{}", "not a calibration"),
         ("nonsense", "not JSON"),
-        (text.replace('"version": 1', '"version": 9'), "version 9"),
+        (text.replace('"version": 2', '"version": 9'), "version 9"),
     ):
         with pytest.raises(CalibrationFileError, match=expected) as error:
             from_text(bad, "a7.json")

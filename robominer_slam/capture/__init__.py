@@ -1,0 +1,1 @@
+"""Captures for calibration: from the whisker device to a labelled recording, and back from one."""
