@@ -3,13 +3,14 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types bench recordings clean venv
+.PHONY: demo test lint types bench fuzz recordings clean venv
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo    simulated robot + daemon + report, about three minutes"
 	@echo "make test    lint, types and tests, under eight minutes"
 	@echo "make bench   accuracy and speed tables (long)"
+	@echo "make fuzz    ten million bytes of noise and damage for each decoder"
 	@echo "make recordings   the five scenarios as recordings, some minutes"
 
 $(VENV)/.sim: pyproject.toml
@@ -39,6 +40,9 @@ test: lint types
 
 bench: $(VENV)/.dev
 	$(BIN)/python benchmarks/pose_graph.py
+
+fuzz: $(VENV)/.dev
+	$(BIN)/python -m benchmarks.fuzz_decoders
 
 recordings: $(VENV)/.sim
 	$(BIN)/python -m benchmarks.make_recordings

@@ -1,20 +1,23 @@
 """One device: its decoder, its clock, its state; bytes with arrival time in, measurements out. No I/O here.
 
 The reader thread (`serial_reader.py`) moves the bytes. States: `absent` -> `synchronising` (open, clock not known
-yet) -> `streaming` <-> `silent` (open, nothing comes) -> `absent`.
+yet) -> `streaming` <-> `silent` (open, nothing comes) -> `absent`. Where the port is not certain, `probing` comes
+first: it is listened to. A silent USB device is `resetting` from time to time.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from drivers.clock import DeviceClock
 from drivers.counters import Counters
-from drivers.framed import FramedDecoder, count_not_finite, ping
+from drivers.decoders import make_decoder
+from drivers.device_time import device_time
 from drivers.measurement import (
+    SCREW_NAMES,
     FloatArray,
     HallFrame,
     ImuSample,
@@ -23,24 +26,23 @@ from drivers.measurement import (
     ScrewAngles,
     ScrewSpeeds,
 )
+from drivers.port_probe import kind_of
 from drivers.readings import (
+    Decoder,
     EncoderReading,
     HallReading,
     HelloReading,
     ImuReading,
     MotorReading,
     OdometryReading,
-    PongReading,
     Reading,
+    ScrewReading,
+    count_not_finite,
 )
 from drivers.settings import DeviceSettings
 
-DeviceState = Literal["absent", "synchronising", "streaming", "silent"]
+DeviceState = Literal["absent", "probing", "synchronising", "streaming", "silent", "resetting"]
 
-#: At first eight quick round trips, so that measurements are stamped 0.2 s after opening; then one a second.
-FIRST_PINGS = 8
-FIRST_PING_INTERVAL_NS = 25_000_000
-PING_INTERVAL_NS = 1_000_000_000
 #: A device that says nothing for this long is reported as silent.
 SILENT_NS = 1_000_000_000
 
@@ -67,7 +69,7 @@ class Device:
         settings: from the configuration.
         state: see the module.
         fault: what is wrong now, in words; empty if nothing is.
-        counters: of this device beyond its decoder's: `before_sync`, `not_finite`, `faults`.
+        counters: of this device beyond its decoder's: `before_sync`, `not_finite`, `faults`, `other_screw`.
     """
 
     def __init__(self, settings: DeviceSettings) -> None:
@@ -77,28 +79,35 @@ class Device:
         self.fault = ""
         self.firmware = ""
         self.counters = Counters()
-        self.clock = DeviceClock()
-        self.decoder = FramedDecoder()
-        self._pings: dict[int, int] = {}
-        self._ping_count = 0
-        self._next_ping_ns = 0
+        self.decoder = self._new_decoder()
+        self.time = device_time(settings, self.counters)
+        #: Readings by kind since the port was opened.
+        self.heard: Counter[str] = Counter()
         self._last_heard_ns = 0
         self._ticks: tuple[int, ...] | None = None
         self._turned = np.zeros(4, dtype=np.int64)
 
-    def opened(self, path: str, now_ns: int) -> None:
-        """The port is open; the device may have restarted, so its clock is asked anew."""
+    def _new_decoder(self) -> Decoder:
+        one = self.settings
+        return make_decoder(one.protocol, one.rows, one.cols, one.representation)
+
+    def opened(self, path: str, now_ns: int, byte_ns: int = 0) -> None:
+        """The port is open; the device may have restarted, so its clock is learned anew.
+
+        Args:
+            path: of the port.
+            now_ns: host's monotonic time.
+            byte_ns: time that a byte takes on the line; 0 where it is not a real serial line.
+        """
         self.state = "synchronising"
         self.path = path
         self.fault = ""
         counted = self.decoder.counters
-        self.decoder = FramedDecoder()
+        self.decoder = self._new_decoder()
         self.decoder.counters = counted
-        self.clock.reset()
-        self._pings.clear()
-        self._ping_count = 0
-        self._next_ping_ns = now_ns
+        self.time.opened(self.decoder, now_ns, byte_ns)
         self._last_heard_ns = now_ns
+        self.heard.clear()
         # A device that restarted counts from zero again: the angle goes on from where it was.
         self._ticks = None
 
@@ -110,22 +119,12 @@ class Device:
         self.counters["faults"] += 1
 
     def to_send(self, now_ns: int) -> bytes:
-        """What to write to the port now: a PING when one is due."""
-        if self.state == "absent" or now_ns < self._next_ping_ns:
-            return b""
-        quick = self._ping_count < FIRST_PINGS or not self.clock.synchronised
-        self._next_ping_ns = now_ns + (FIRST_PING_INTERVAL_NS if quick else PING_INTERVAL_NS)
-        nonce = self._ping_count & 0xFFFFFFFF
-        self._ping_count += 1
-        # Answers that never came must not pile up.
-        while len(self._pings) >= 16:
-            del self._pings[next(iter(self._pings))]
-        self._pings[nonce] = now_ns
-        return ping(nonce, nonce)
+        """What to write to the port now: what the protocol needs for time, or to start the device."""
+        return b"" if self.state == "absent" else self.time.to_send(now_ns)
 
     def check_silence(self, now_ns: int) -> None:
         """Report a device that is open but says nothing."""
-        if self.state == "streaming" and now_ns - self._last_heard_ns > SILENT_NS:
+        if self.state in ("synchronising", "streaming") and now_ns - self._last_heard_ns > SILENT_NS:
             self.state = "silent"
             self.fault = "open, but nothing comes"
 
@@ -133,46 +132,62 @@ class Device:
         """Bytes that arrived at `arrival_ns`; returns the measurements that they complete."""
         measurements: list[Measurement] = []
         for reading in self.decoder.feed(data):
-            match reading:
-                case PongReading():
-                    sent_ns = self._pings.pop(reading.nonce, None)
-                    if sent_ns is None:
-                        self.counters["unasked_pongs"] += 1
-                    else:
-                        self.clock.add_round_trip(sent_ns, arrival_ns, reading.device_time_us)
-                case HelloReading():
-                    self.firmware = reading.text
-                case _:
-                    measurement = self._measurement(reading)
-                    if measurement is not None:
-                        measurements.append(measurement)
-                        self._last_heard_ns = arrival_ns
-                        if self.state != "streaming":
-                            self.state = "streaming"
-                            self.fault = ""
+            if isinstance(reading, HelloReading):
+                self.firmware = reading.text
+                continue
+            kind = kind_of(reading)
+            if kind is not None:
+                self.heard[kind] += 1
+            if self.time.take(reading, arrival_ns):
+                continue
+            measurement = self._measurement(reading)
+            if measurement is not None:
+                measurements.append(measurement)
+                self._last_heard_ns = arrival_ns
+                if self.state not in ("streaming", "probing"):
+                    self.state = "streaming"
+                    self.fault = ""
         return measurements
 
     def _measurement(self, reading: Reading) -> Measurement | None:
         if count_not_finite(reading):
             self.counters["not_finite"] += 1
             return None
-        if not self.clock.synchronised or reading.device_time_us is None:
+        stamp = self.time.stamp_ns(reading)
+        if stamp is None:
             self.counters["before_sync"] += 1
             return None
-        stamp = self.clock.to_host_ns(reading.device_time_us)
         match reading:
             case HallReading():
-                return HallFrame(stamp, reading.field_mT, reading.valid, reading.sensor_period_us * 1000)
+                period = self.time.sensor_period_ns(reading)
+                return HallFrame(stamp, reading.field_mT, reading.valid, period, reading.representation)
             case ImuReading():
-                return ImuSample(stamp, reading.gyro, reading.acceleration, reading.orientation_xyzw)
+                orientation = reading.orientation_xyzw if self.settings.use_orientation else None
+                return ImuSample(stamp, reading.gyro, reading.acceleration, orientation)
             case EncoderReading():
                 return ScrewAngles(stamp, self._unwrap(reading.ticks))
             case MotorReading():
                 return ScrewSpeeds(stamp, reading.speed, reading.current_mA, reading.voltage_V)
+            case ScrewReading():
+                return self._screw_speed(stamp, reading)
             case OdometryReading():
                 return OdometrySample(stamp, reading.velocity)
             case _:
                 return None
+
+    def _screw_speed(self, stamp: int, reading: ScrewReading) -> ScrewSpeeds | None:
+        expected = self.settings.screw
+        if expected is not None and SCREW_NAMES[reading.screw] != expected:
+            self.counters["other_screw"] += 1
+            self.fault = f"expected the board of screw {expected}, found that of {SCREW_NAMES[reading.screw]}"
+            return None
+        speed = np.full(4, np.nan)
+        speed[reading.screw] = reading.speed
+        if reading.current_mA is None or reading.voltage_V is None:
+            return ScrewSpeeds(stamp, speed)
+        current, voltage = np.full(4, np.nan), np.full(4, np.nan)
+        current[reading.screw], voltage[reading.screw] = reading.current_mA, reading.voltage_V
+        return ScrewSpeeds(stamp, speed, current, voltage)
 
     def _unwrap(self, ticks: tuple[int, ...]) -> FloatArray:
         if self._ticks is not None:
@@ -189,8 +204,8 @@ class Device:
             path=self.path,
             firmware=self.firmware,
             counters={**self.decoder.counters, **self.counters},
-            clock_offset_ns=self.clock.offset_ns,
-            clock_uncertainty_ns=self.clock.uncertainty_ns,
-            clock_drift=self.clock.drift,
+            clock_offset_ns=self.time.offset_ns,
+            clock_uncertainty_ns=self.time.uncertainty_ns,
+            clock_drift=self.time.drift,
             fault=self.fault,
         )

@@ -16,6 +16,7 @@ from cobs import cobs
 from drivers.counters import Counters
 from drivers.measurement import FloatArray
 from drivers.readings import (
+    RADIANS_PER_SECOND_PER_RPM,
     EncoderReading,
     HallReading,
     HelloReading,
@@ -34,7 +35,6 @@ PING, REZERO, IDENTIFY = 0xF0, 0xF1, 0xF2
 MAX_ENCODED_BYTES = 32768
 SCREW_COUNT = 4
 MILLITESLA_PER_LSB = 0.01
-RADIANS_PER_SECOND_PER_RPM = 2.0 * np.pi / 60.0
 
 _HEADER = struct.Struct("<BBHI")
 _CRC = struct.Struct("<I")
@@ -131,20 +131,6 @@ class FramedDecoder:
         if 0 < missing < 0x8000:
             self.counters["lost"] += missing
         return True
-
-
-def count_not_finite(reading: Reading) -> int:
-    """How many values of a reading are not finite numbers; such a reading is never used."""
-    match reading:
-        case ImuReading(gyro=gyro, acceleration=acceleration):
-            parts = [part for part in (gyro, acceleration, reading.orientation_xyzw) if part is not None]
-        case OdometryReading(velocity=velocity):
-            parts = [velocity]
-        case MotorReading(speed=speed, current_mA=current, voltage_V=voltage):
-            parts = [speed, current, voltage]
-        case _:
-            return 0
-    return sum(int(np.count_nonzero(~np.isfinite(part))) for part in parts)
 
 
 def _expect(payload: bytes, size: int) -> None:

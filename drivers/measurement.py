@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 FloatArray: TypeAlias = NDArray[np.float64]
 BoolArray: TypeAlias = NDArray[np.bool_]
 
+#: Names of the screws in this program's order; RM3's motor modules are numbered in the same order.
+SCREW_NAMES = ("front_right", "rear_right", "rear_left", "front_left")
+
 
 @dataclass(frozen=True, slots=True)
 class HallFrame:
@@ -25,7 +28,8 @@ class HallFrame:
         field_mT: magnetic field, shape (rows, cols, 3), mT; rows of invalid sensors hold zeros.
         valid: shape (rows, cols); False where the device reported no reading.
         sensor_period_ns: time from one sensor's reading to the next, row-major, invalid ones included.
-        representation: `Cartesian` (Bx, By, Bz in mT) or `Spherical` (azimuth deg, polar deg, magnitude mT).
+        representation: `Cartesian` (Bx, By, Bz in mT); `Spherical` (azimuth deg, polar deg, magnitude mT; a magnitude
+            of zero was not sent); `Direction` (unit vectors: what `spherical.cartesian_frame` makes of those).
     """
 
     stamp_ns: int

@@ -15,6 +15,7 @@ import numpy as np
 from drivers import whisker_array
 from drivers.counters import Counters
 from drivers.measurement import (
+    SCREW_NAMES,
     FloatArray,
     HallFrame,
     ImuSample,
@@ -23,6 +24,7 @@ from drivers.measurement import (
     ScrewAngles,
     ScrewSpeeds,
 )
+from drivers.readings import RADIANS_PER_SECOND_PER_RPM
 from drivers.ros_messages import Message, MessageError, deserialize, header, new, serialize, time_to_ns
 
 WHISKER_ARRAY = whisker_array.TYPENAME
@@ -32,9 +34,6 @@ MOTOR_FEEDBACK = "robominer_msgs/msg/MotorModuleFeedback"
 TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 ODOMETRY = "nav_msgs/msg/Odometry"
 
-#: Names of the screws in this program's order; RM3's motor modules are numbered in the same order.
-SCREW_NAMES = ("front_right", "rear_right", "rear_left", "front_left")
-RADIANS_PER_SECOND_PER_RPM = 2.0 * np.pi / 60.0
 #: sensor_msgs/Imu: a covariance whose first element is -1 says that the estimate is absent.
 ABSENT = -1.0
 QUATERNION_TOLERANCE = 0.05

@@ -8,19 +8,27 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
+import numpy as np
+
 from drivers.counters import Counters
 from drivers.measurement import BoolArray, FloatArray
+
+RADIANS_PER_SECOND_PER_RPM = 2.0 * np.pi / 60.0
 
 
 @dataclass(frozen=True, slots=True)
 class HallReading:
-    """Field of the whole array, shape (rows, cols, 3), mT, with validity and the time between sensors."""
+    """Field of the whole array, shape (rows, cols, 3), with validity and the time between sensors.
+
+    `representation` as of `measurement.HallFrame`; a sensor period of 0 says that the device does not tell.
+    """
 
     device_time_us: int | None
     sequence: int | None
     field_mT: FloatArray
     valid: BoolArray
     sensor_period_us: int
+    representation: str = "Cartesian"
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +63,18 @@ class MotorReading:
 
 
 @dataclass(frozen=True, slots=True)
+class ScrewReading:
+    """Speed (rad/s) of one screw (0 FR, 1 RR, 2 RL, 3 FL), current (mA) and voltage (V) where they are sent."""
+
+    device_time_us: int | None
+    sequence: int | None
+    screw: int
+    speed: float
+    current_mA: float | None
+    voltage_V: float | None
+
+
+@dataclass(frozen=True, slots=True)
 class OdometryReading:
     """Body velocity vx, vy (m/s), wz (rad/s), shape (3,), mean over the interval that ends at the time."""
 
@@ -82,7 +102,14 @@ class PongReading:
 
 
 Reading: TypeAlias = (
-    HallReading | ImuReading | EncoderReading | MotorReading | OdometryReading | HelloReading | PongReading
+    HallReading
+    | ImuReading
+    | EncoderReading
+    | MotorReading
+    | ScrewReading
+    | OdometryReading
+    | HelloReading
+    | PongReading
 )
 
 
@@ -94,3 +121,21 @@ class Decoder(Protocol):
     def feed(self, data: bytes) -> list[Reading]:
         """Take some bytes; return the readings that they complete."""
         ...
+
+
+def count_not_finite(reading: Reading) -> int:
+    """How many values of a reading are not finite numbers; such a reading is never used.
+
+    A decoder of whisker frames makes such sensors invalid itself: the rest of the frame is good.
+    """
+    parts: list[FloatArray | float | None]
+    match reading:
+        case ImuReading():
+            parts = [reading.gyro, reading.acceleration, reading.orientation_xyzw]
+        case OdometryReading():
+            parts = [reading.velocity]
+        case MotorReading() | ScrewReading():
+            parts = [reading.speed, reading.current_mA, reading.voltage_V]
+        case _:
+            return 0
+    return sum(int(np.count_nonzero(~np.isfinite(part))) for part in parts if part is not None)

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 from drivers.ground_truth import TYPENAME as GROUND_TRUTH_TYPE
 from drivers.ground_truth import WHISKERS_TYPENAME as WHISKER_TRUTH_TYPE
+from drivers.measurement import SCREW_NAMES
 from drivers.measurement_messages import (
     IMU,
     JOINT_STATE,
     MOTOR_FEEDBACK,
     ODOMETRY,
-    SCREW_NAMES,
     TWIST_STAMPED,
     WHISKER_ARRAY,
 )

@@ -8,35 +8,33 @@ import selectors
 import threading
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import serial
 
-from drivers.device import Device, DeviceState, DeviceStatus
+from drivers.device import Device, DeviceStatus
 from drivers.measurement import Measurement
-from drivers.port_discovery import check_port_name, find_paths
+from drivers.open_port import FIRST_RETRY_S, OpenPort, node
+from drivers.port_discovery import byte_time_ns, canonical, check_port_name, find_paths
+from drivers.port_probe import may_speak, verdict
 from drivers.settings import DeviceSettings
+from drivers.usb_recovery import FIRST_RESET_NS, LONGEST_RESET_NS, UsbResetError, reset, usb_port
 
 log = logging.getLogger(__name__)
 
 #: The thread wakes at least this often, for pings and for ports that came back.
 TICK_S = 0.02
-FIRST_RETRY_S = 0.25
 #: A device that is plugged in again must be in use within 2 s.
 LONGEST_RETRY_S = 1.0
 #: 10 s of a full robot: 25 frames, 100 IMU samples, 50 encoder readings, 30 odometry readings a second.
 QUEUE_LENGTH = 2048
 READ_BYTES = 65536
-
-
-class _OpenPort:
-    """A device and its port, when it has one, and when to try again."""
-
-    def __init__(self, device: Device) -> None:
-        self.device = device
-        self.port: serial.Serial | None = None
-        self.retry_at = 0.0
-        self.retry_after = FIRST_RETRY_S
-        self.logged: tuple[DeviceState, str] = ("streaming", "")
+#: A port that did not have the device is not tried again so soon; a silent one may still be starting.
+WRONG_AGAIN_S = 10.0
+SILENT_AGAIN_S = 1.0
+#: So many failures in a row without a measurement between them call for a reset as well.
+FAILURES_BEFORE_RESET = 5
+NOT_FOUND = "port {}: not found on the ports that are there"
 
 
 class SerialReader:
@@ -45,15 +43,26 @@ class SerialReader:
     Use as a context manager; `get` returns measurements in the order of their arrival.
     """
 
-    def __init__(self, settings: Sequence[DeviceSettings]) -> None:
+    def __init__(self, settings: Sequence[DeviceSettings], usb_backend: object = None) -> None:
+        """Read these devices.
+
+        Args:
+            settings: of the devices.
+            usb_backend: pyusb's, for resets; None takes libusb.
+
+        Raises:
+            PortNameError: a port's name that can never be right.
+        """
         for one in settings:
             check_port_name(one.port)
-        self._ports = [_OpenPort(Device(one)) for one in settings]
+        self._ports = [OpenPort(Device(one)) for one in settings]
         self._queue: queue.Queue[tuple[str, Measurement]] = queue.Queue(QUEUE_LENGTH)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="drivers", daemon=True)
         self._selector = selectors.DefaultSelector()
         self._failure: BaseException | None = None
+        self._usb_backend = usb_backend
+        self._resets: ThreadPoolExecutor | None = None
         self.dropped = 0
 
     def __enter__(self) -> SerialReader:
@@ -66,6 +75,8 @@ class SerialReader:
         for entry in self._ports:
             self._close(entry)
         self._selector.close()
+        if self._resets is not None:
+            self._resets.shutdown(wait=False, cancel_futures=True)
 
     def get(self, timeout: float) -> tuple[str, Measurement] | None:
         """The next (device, measurement), or None after `timeout` seconds.
@@ -95,7 +106,9 @@ class SerialReader:
 
     def _turn(self) -> None:
         for entry in self._ports:
-            if entry.port is None and time.monotonic() >= entry.retry_at:
+            if entry.reset is not None:
+                self._after_reset(entry)
+            elif entry.port is None and time.monotonic() >= entry.retry_at:
                 self._open(entry)
         if not self._selector.get_map():
             self._stop.wait(TICK_S)
@@ -104,16 +117,22 @@ class SerialReader:
                 self._read(key.data)
         now = time.monotonic_ns()
         for entry in self._ports:
+            if entry.device.state == "probing":
+                self._probe(entry, now)
             self._write(entry, now)
             entry.device.check_silence(now)
+            self._reset_if_wedged(entry, now)
             self._log_change(entry)
 
-    def _open(self, entry: _OpenPort) -> None:
-        taken = frozenset(other.device.path for other in self._ports if other.device.path is not None)
+    def _open(self, entry: OpenPort) -> None:
+        taken = frozenset(canonical(e.device.path) for e in self._ports if e.device.path is not None)
         device = entry.device
         paths = find_paths(device.settings.port, taken)
         fault = f"port {device.settings.port} is not there"
         for path in paths:
+            if entry.refused.get(node(path), 0.0) > time.monotonic():
+                fault = NOT_FOUND.format(device.settings.port)
+                continue
             try:
                 port = serial.Serial(path, device.settings.baud, timeout=0, write_timeout=0.2, exclusive=True)
             except (serial.SerialException, OSError, ValueError) as error:
@@ -121,15 +140,78 @@ class SerialReader:
                 continue
             entry.port = port
             entry.retry_after = FIRST_RETRY_S
+            entry.opened_ns = entry.bytes_ns = time.monotonic_ns()
+            entry.any_bytes = False
+            entry.other_screws = device.counters["other_screw"]
+            entry.counted = device.decoder.counters.copy()
             self._selector.register(port.fileno(), selectors.EVENT_READ, entry)
-            device.opened(path, time.monotonic_ns())
+            device.opened(path, entry.opened_ns, byte_time_ns(path, device.settings.baud))
+            if entry.ambiguous:
+                device.state = "probing"
             return
         if device.fault != fault:
             device.lost(fault)
+        else:
+            device.state = "absent"
         entry.retry_at = time.monotonic() + entry.retry_after
         entry.retry_after = min(entry.retry_after * 2.0, LONGEST_RETRY_S)
 
-    def _read(self, entry: _OpenPort) -> None:
+    def _probe(self, entry: OpenPort, now_ns: int) -> None:
+        """Keep the port if it has the device; leave it if it has another."""
+        device, path = entry.device, entry.device.path
+        found = verdict(
+            device.settings,
+            device.heard,
+            entry.known,
+            other_screw=device.counters["other_screw"] > entry.other_screws,
+            elapsed_ns=now_ns - entry.opened_ns,
+            any_bytes=entry.any_bytes,
+        )
+        if found == "right":
+            device.state = "synchronising"
+        elif found != "listening" and path is not None:
+            entry.refused = {one: until for one, until in entry.refused.items() if until > time.monotonic()}
+            again = WRONG_AGAIN_S if found == "wrong" else SILENT_AGAIN_S
+            entry.refused[node(path)] = time.monotonic() + again
+            self._close(entry)
+            # What other devices say is no fault of this one.
+            device.decoder.counters = entry.counted
+            device.state, device.path = "absent", None
+            device.fault = NOT_FOUND.format(device.settings.port)
+            entry.retry_at = time.monotonic()
+
+    def _reset_if_wedged(self, entry: OpenPort, now_ns: int) -> None:
+        """Reset a USB device that is open but has sent nothing for long, or that fails again and again."""
+        silent = entry.port is not None and entry.device.state == "silent"
+        silent = silent and now_ns - max(entry.bytes_ns, entry.opened_ns) > entry.reset_after_ns
+        if entry.reset is not None or not (silent or entry.failures >= FAILURES_BEFORE_RESET):
+            return
+        entry.failures = 0
+        if entry.device.path is not None:
+            entry.usb = usb_port(entry.device.path) or entry.usb
+        entry.bytes_ns = now_ns
+        if entry.usb is None:
+            return
+        entry.reset_after_ns = min(2 * entry.reset_after_ns, LONGEST_RESET_NS)
+        self._close(entry)
+        entry.device.state, entry.device.path = "resetting", None
+        entry.device.counters["resets"] += 1
+        if self._resets is None:
+            # A reset takes up to a second, in which the other devices must be read.
+            self._resets = ThreadPoolExecutor(1, thread_name_prefix="usb-reset")
+        entry.reset = self._resets.submit(reset, *entry.usb, backend=self._usb_backend)
+
+    def _after_reset(self, entry: OpenPort) -> None:
+        if entry.reset is None or not entry.reset.done():
+            return
+        error, entry.reset = entry.reset.exception(), None
+        if error is not None and not isinstance(error, UsbResetError):
+            raise error
+        entry.device.state = "absent"
+        entry.device.fault = "silent, has been reset" if error is None else f"silent, and cannot be reset: {error}"
+        entry.retry_at = time.monotonic()
+
+    def _read(self, entry: OpenPort) -> None:
         port = entry.port
         if port is None:
             return
@@ -141,19 +223,35 @@ class SerialReader:
         arrival_ns = time.monotonic_ns()
         if not data:
             return
-        for measurement in entry.device.received(data, arrival_ns):
-            self._deliver(entry.device.settings.name, measurement)
+        entry.bytes_ns, entry.any_bytes = arrival_ns, True
+        device = entry.device
+        measurements = device.received(data, arrival_ns)
+        if device.state == "probing":
+            self._probe(entry, arrival_ns)
+            if entry.port is None or device.state == "probing":
+                return
+        if measurements:
+            entry.failures, entry.reset_after_ns = 0, FIRST_RESET_NS
+            if entry.ambiguous:
+                entry.known = entry.known | frozenset(device.heard)
+        for measurement in measurements:
+            self._deliver(device.settings.name, measurement)
 
-    def _write(self, entry: _OpenPort, now_ns: int) -> None:
+    def _write(self, entry: OpenPort, now_ns: int) -> None:
+        device = entry.device
         if entry.port is None:
             return
-        data = entry.device.to_send(now_ns)
+        if device.state == "probing" and not may_speak(
+            device.settings, device.heard, elapsed_ns=now_ns - entry.opened_ns, any_bytes=entry.any_bytes
+        ):
+            return
+        data = device.to_send(now_ns)
         if not data:
             return
         try:
             entry.port.write(data)
         except serial.SerialTimeoutException:
-            entry.device.counters["write_timeouts"] += 1
+            device.counters["write_timeouts"] += 1
         except (serial.SerialException, OSError) as error:
             self._lost(entry, f"write failed: {_reason(error)}")
 
@@ -170,12 +268,16 @@ class SerialReader:
                 except queue.Empty:
                     continue
 
-    def _lost(self, entry: _OpenPort, fault: str) -> None:
+    def _lost(self, entry: OpenPort, fault: str) -> None:
+        path = entry.device.path
+        entry.failures += 1
+        if entry.failures >= FAILURES_BEFORE_RESET and path is not None:
+            entry.usb = usb_port(path) or entry.usb
         self._close(entry)
         entry.device.lost(fault)
         entry.retry_at = time.monotonic() + FIRST_RETRY_S
 
-    def _close(self, entry: _OpenPort) -> None:
+    def _close(self, entry: OpenPort) -> None:
         if entry.port is None:
             return
         self._selector.unregister(entry.port.fileno())
@@ -185,10 +287,11 @@ class SerialReader:
             log.warning("device %s: closing failed: %s", entry.device.settings.name, error)
         entry.port = None
 
-    def _log_change(self, entry: _OpenPort) -> None:
+    def _log_change(self, entry: OpenPort) -> None:
         device = entry.device
         now = (device.state, device.fault)
-        if now == entry.logged:
+        # Listening to one port after the other is no change worth a line.
+        if now == entry.logged or device.state == "probing":
             return
         entry.logged = now
         level = logging.WARNING if device.fault else logging.INFO

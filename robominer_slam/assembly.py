@@ -16,11 +16,15 @@ from robominer_slam.estimation.fused_odometry import FusedOdometry
 from robominer_slam.estimation.integrated_odometry import IntegratedOdometry
 from robominer_slam.estimation.odometry_state import DeadReckoning
 from robominer_slam.estimation.screw_kinematics import forward_matrix
+from robominer_slam.flow_bend import FlowBend
 from robominer_slam.layout import WhiskerLayout
 from robominer_slam.pipeline import Pipeline
+from robominer_slam.rest_tracking import RestTracker
 from robominer_slam.slam.backend_runner import BackendRunner, SynchronousRunner, ThreadedRunner
 from robominer_slam.slam.composite_scan import CompositeScan
 from robominer_slam.slam.thesis import ThesisBackend
+from robominer_slam.whisker_health import WhiskerHealth
+from robominer_slam.whisker_monitor import WhiskerMonitor
 
 FloatArray = NDArray[np.float64]
 Execution = Literal["synchronous", "threaded"]
@@ -35,6 +39,11 @@ def build_pipeline(
     return Pipeline(
         dead_reckoning=_dead_reckoning(configuration),
         angle_estimator=AngleEstimator(model),
+        monitor=WhiskerMonitor(
+            WhiskerHealth(configuration.health, layout, model.rest_mT, model.fitted, folded=model.folded),
+            RestTracker(configuration.health, layout),
+            FlowBend(contact, layout),
+        ),
         contact_model=ContactModel(
             layout, np.deg2rad(contact.min_inclination_deg), np.deg2rad(contact.max_inclination_deg)
         ),

@@ -133,7 +133,7 @@ class Daemon:
             *(status_report.device_diagnostic(device) for device in self._source.status()),
         ]
         if frame is not None:
-            entries.append(status_report.whiskers_diagnostic(frame, self._layout.cols))
+            entries.append(status_report.whiskers_diagnostic(frame, self._layout, self._pipeline))
         return entries
 
     def _finish(self) -> None:

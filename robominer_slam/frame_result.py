@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,6 +13,7 @@ from calibration.angle_estimator import WhiskerAngles
 from robominer_slam.contacts import Contacts
 from robominer_slam.estimation.odometry_state import OdometryState
 from robominer_slam.slam.keyframe import BackendResult, Keyframe
+from robominer_slam.whisker_health import WhiskerState
 
 FloatArray = NDArray[np.float64]
 LocalizationState = Literal["lost", "relocalizing", "dead_reckoning", "tracking"]
@@ -27,7 +28,8 @@ class FrameResult:
         odometry: dead reckoning's state.
         T_odom_base, T_map_odom, T_map_base: poses, shape (4, 4).
         covariance: of (x, y, yaw) in map, shape (3, 3).
-        angles: of all whiskers.
+        angles: of all whiskers; not valid where a whisker is not to be believed.
+        whisker_states: whose readings are not believed and why: index to state and stamp of its beginning, ns.
         contacts: of those that touch.
         state: how sure the localisation is.
         keyframe: the keyframe that this frame completed, or None.
@@ -41,6 +43,7 @@ class FrameResult:
     T_map_base: FloatArray
     covariance: FloatArray
     angles: WhiskerAngles
+    whisker_states: Mapping[int, tuple[WhiskerState, int]]
     contacts: Contacts
     state: LocalizationState
     keyframe: Keyframe | None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -10,14 +11,17 @@ from numpy.typing import NDArray
 
 from calibration.angle_estimator import AngleEstimator
 from drivers.measurement import HallFrame, ImuSample, Measurement
+from drivers.spherical import cartesian_frame
 from robominer_slam import geometry
 from robominer_slam.contacts import ContactModel
+from robominer_slam.estimation.attitude_increments import AttitudeIncrements
 from robominer_slam.estimation.odometry_state import DeadReckoning, OdometryState
 from robominer_slam.frame_result import FrameResult, LocalizationState
 from robominer_slam.reorder import ReorderBuffer
 from robominer_slam.slam.backend_runner import BackendRunner
 from robominer_slam.slam.composite_scan import CompositeScan
 from robominer_slam.slam.keyframe import BackendResult, Keyframe
+from robominer_slam.whisker_monitor import WhiskerMonitor
 
 FloatArray = NDArray[np.float64]
 
@@ -33,6 +37,7 @@ class Pipeline:
     Args:
         dead_reckoning: pose in odom.
         angle_estimator: the array's calibration.
+        monitor: which whiskers can be believed.
         contact_model: who touches, where.
         composite_scan: makes keyframes; None for odometry alone.
         runner: of the back-end; None for odometry alone.
@@ -44,6 +49,7 @@ class Pipeline:
         self,
         dead_reckoning: DeadReckoning,
         angle_estimator: AngleEstimator,
+        monitor: WhiskerMonitor,
         contact_model: ContactModel,
         composite_scan: CompositeScan | None,
         runner: BackendRunner | None,
@@ -52,6 +58,7 @@ class Pipeline:
     ) -> None:
         self.reorder = ReorderBuffer(reorder_window_ns)
         self.angle_estimator = angle_estimator
+        self.monitor = monitor
         self.runner = runner
         self.paused = False
         self.wrong_size_frames = 0
@@ -68,6 +75,7 @@ class Pipeline:
         self._contact_ns: int | None = None
         self._odometry_ns: int | None = None
         self._last_frame: HallFrame | None = None
+        self._increments: defaultdict[str, AttitudeIncrements] = defaultdict(AttitudeIncrements)
 
     def add(self, device: str, measurement: Measurement) -> list[FrameResult]:
         """Take a measurement of a device; returns the results of the frames that it releases."""
@@ -82,6 +90,7 @@ class Pipeline:
         if self._last_frame is None:
             return False
         self.angle_estimator.rezero(self._last_frame.field_mT, self._last_frame.valid)
+        self.monitor.rest.reset()
         return True
 
     def localize(self, x: float, y: float, yaw: float) -> None:
@@ -109,7 +118,7 @@ class Pipeline:
                     results.append(result)
                 continue
             if isinstance(measurement, ImuSample):
-                measurement = self._in_base(device, measurement)
+                measurement = self._in_base(device, self._increments[device].with_rate(measurement))
             elif self._dead_reckoning.measures_motion(measurement):
                 self._odometry_ns = measurement.stamp_ns
             self._dead_reckoning.add(measurement)
@@ -123,13 +132,19 @@ class Pipeline:
             # A burst out of order, or a device clock that jumped back: poses only go forward in time.
             self.stale_frames += 1
             return None
+        frame = cartesian_frame(frame)
+        if frame.representation == "Direction" and self.angle_estimator.representation != "Direction":
+            # A calibration of fields says nothing about directions alone: such a frame has no contacts.
+            frame = replace(frame, valid=np.zeros_like(frame.valid))
         self._last_frame = frame
         stamp = frame.stamp_ns
         angles = self.angle_estimator.angles(frame.field_mT, frame.valid)
-        contacts = self._contact_model.contacts(angles.inclination, angles.azimuth, angles.valid)
+        odometry = self._dead_reckoning.state_at(stamp)
+        well, may_touch = self.monitor.judge(frame, angles, odometry, self.angle_estimator)
+        angles = replace(angles, valid=well)
+        contacts = self._contact_model.contacts(angles.inclination, angles.azimuth, may_touch)
         if len(contacts.index):
             self._contact_ns = stamp
-        odometry = self._dead_reckoning.state_at(stamp)
         T_odom_base = planar_pose(odometry)
         backend_results = self.runner.due(stamp) if self.runner is not None else []
         for result in backend_results:
@@ -144,6 +159,7 @@ class Pipeline:
             T_map_base=self._T_map_odom @ T_odom_base,
             covariance=self._covariance(odometry),
             angles=angles,
+            whisker_states=self.monitor.health.states(),
             contacts=contacts,
             state=state,
             keyframe=keyframe,

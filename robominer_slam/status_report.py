@@ -9,6 +9,7 @@ import numpy as np
 
 from drivers.device import DeviceStatus
 from robominer_slam.frame_result import FrameResult
+from robominer_slam.layout import WhiskerLayout
 from robominer_slam.mapping.keyframe_map import KeyframeMap
 from robominer_slam.pipeline import Pipeline
 from robominer_slam.publishing.report_messages import Diagnostic, Level
@@ -67,12 +68,29 @@ def slam_diagnostic(
     return Diagnostic("localization", Level.OK, frame.state, values)
 
 
-def whiskers_diagnostic(frame: FrameResult, cols: int) -> Diagnostic:
-    """Whiskers that say nothing, by row and column."""
-    silent = [f"({i // cols}, {i % cols})" for i in np.flatnonzero(~frame.angles.valid)]
-    values = {"valid": str(int(frame.angles.valid.sum())), "invalid": " ".join(silent)}
-    if silent:
-        return Diagnostic("whiskers", Level.WARN, f"{len(silent)} without a usable reading: {' '.join(silent)}", values)
+def whiskers_diagnostic(frame: FrameResult, layout: WhiskerLayout, pipeline: Pipeline) -> Diagnostic:
+    """Whiskers that are not believed, by row and column: state, and for how many seconds; and those out of range."""
+    cols = layout.cols
+    values = {"valid": str(int(frame.angles.valid.sum()))}
+    words = []
+    for i, (state, since_ns) in sorted(frame.whisker_states.items()):
+        name, age_s = state.name.lower(), max(0.0, (frame.stamp_ns - since_ns) * 1e-9)
+        values[f"whisker ({i // cols}, {i % cols})"] = f"{name} for {age_s:.0f} s"
+        words.append(f"({i // cols}, {i % cols}) {name}")
+    unusable = np.flatnonzero(layout.present & ~frame.angles.valid).tolist()
+    invalid = [f"({i // cols}, {i % cols})" for i in unusable if i not in frame.whisker_states]
+    values["invalid"] = " ".join(invalid)
+    followed = np.rad2deg(np.hypot(*pipeline.monitor.rest.followed))
+    values["rest.followed_max_deg"] = f"{followed.max():.2f}"
+    bend = pipeline.monitor.flow.bend
+    if bend is not None:
+        values["flow.bend_deg"] = f"{np.rad2deg(np.hypot(*bend)):.1f}"
+        values["flow.direction_deg"] = f"{np.rad2deg(np.arctan2(bend[1], bend[0])):.0f}"
+    if words:
+        return Diagnostic("whiskers", Level.WARN, f"{len(words)} left out: {', '.join(words)}", values)
+    if invalid:
+        text = f"{len(invalid)} without a usable reading: {' '.join(invalid)}"
+        return Diagnostic("whiskers", Level.WARN, text, values)
     return Diagnostic("whiskers", Level.OK, "all readings usable", values)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from pydantic import BaseModel
 
+from robominer_slam.configuration.devices import device_settings
 from robominer_slam.configuration.file import ConfigurationError, load, parse, to_toml
 from robominer_slam.configuration.model import Configuration
 
@@ -21,6 +22,24 @@ def test_the_printed_configuration_reads_back_the_same():
     assert "keyframe_distance = 0.12 # m; 0.01 to 5; thesis 3.4.4: along x or y" in printed
 
 
+def test_every_protocol_prints_and_reads_back_with_its_own_keys_only():
+    extra = {"rm3-motor": "screw = 'rear_left'", "rm3-compressed": "rows = 10\nsensor_period_us = 600"}
+    protocols = ("framed", "rm3-plaintext", "rm3-compressed", "rm3-motor", "bno08x-rvc", "mip")
+    text = "".join(
+        f"[[device]]\nname = '{name}'\nport = '/dev/{name}'\nprotocol = '{name}'\n{extra.get(name, '')}\n"
+        for name in protocols
+    )
+    configuration = parse(text, "c.toml")
+    printed = to_toml(configuration)
+    assert parse(printed, "printed") == configuration
+    assert printed.count("representation =") == 2
+    # The 3DM-CV7's z axis points down unless the configuration says how it is mounted.
+    assert [device.mount_rpy_deg[0] for device in configuration.device] == [0, 0, 0, 0, 0, 180]
+    settings = {one.protocol: one for one in device_settings(configuration)}
+    assert (settings["rm3-compressed"].rows, settings["rm3-compressed"].representation) == (10, "spherical")
+    assert settings["rm3-motor"].screw == "rear_left"
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -32,6 +51,16 @@ def test_the_printed_configuration_reads_back_the_same():
         ("[[device]]\nname = 'a'", "c.toml: device[0].port: missing; expected path"),
         ("[[device]]\nname='a'\nport='/dev/x'\nbaudrate=3", "device[0].baudrate: unknown key; did you mean 'baud'?"),
         ("[[device]]\nname='a'\nport='/a'\n[[device]]\nname='a'\nport='/b'", "a stands twice"),
+        ("[[device]]\nname='a'\nport='/x'\nprotocol='morse'", "device[0].protocol: expected 'framed', 'rm3-plaintext'"),
+        (
+            "[[device]]\nname='a'\nport='/x'\nprotocol='bno08x-rvc'\nrepresentation='cartesian'",
+            "device[0]: expected no key representation with protocol 'bno08x-rvc': representation is for rm3-plaintext",
+        ),
+        ("[[device]]\nname='a'\nport='/x'\nscrew='rear_left'", "screw is for rm3-motor"),
+        (
+            "[[device]]\nname='a'\nport='/x'\nprotocol='rm3-motor'\nscrew='left'",
+            "device[0].screw: expected 'front_right'",
+        ),
         ("[robot]\nid = 'a/b'", "robot.id: expected a name without spaces"),
         ("[zenoh]\nlisten = 'tcp/x:1'", "zenoh.listen: expected a list"),
         ("[robot", "c.toml: not TOML"),

@@ -10,8 +10,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.framed import MAX_ENCODED_BYTES, FramedDecoder, count_not_finite, ping
-from drivers.readings import EncoderReading, HallReading, HelloReading, ImuReading, OdometryReading, PongReading
+from drivers.framed import MAX_ENCODED_BYTES, FramedDecoder, ping
+from drivers.readings import (
+    EncoderReading,
+    HallReading,
+    HelloReading,
+    ImuReading,
+    OdometryReading,
+    PongReading,
+    count_not_finite,
+)
 from tests.conftest import make_packet
 
 

@@ -31,6 +31,8 @@ def frame(ms: int, model, inclination: float = 0.5) -> HallFrame:
     ideal = dipole_field(np.full(64, inclination), np.zeros(64))
     # Every made whisker has its own strength: scale to its rest field.
     field = ideal * (model.rest_mT[:, 2] / dipole_field(np.zeros(1), np.zeros(1))[0, 2])[:, None]
+    # Readings without any noise would count as stuck.
+    field = field + np.random.default_rng(ms).normal(0.0, 0.05, field.shape)
     return HallFrame(ms * MS, field.reshape(8, 8, 3), np.ones((8, 8), dtype=bool))
 
 

@@ -9,6 +9,7 @@ from importlib.metadata import entry_points
 
 import click
 
+from calibration.capture_labels import CaptureError
 from calibration.file_format import CalibrationFileError
 from calibration.fit import FitError
 from drivers.port_discovery import PortNameError
@@ -23,6 +24,7 @@ from robominer_slam.store import StoreError
 #: Errors that are the user's to mend; anything else is ours and shows a traceback.
 USER_ERRORS = (
     CalibrationFileError,
+    CaptureError,
     ConfigurationError,
     FitError,
     LayoutError,
@@ -36,6 +38,7 @@ USER_ERRORS = (
 #: Imported only when called, so that `--help` and the daemon load no more than they need.
 COMMANDS = {
     "calibrate": "robominer_slam.cli.calibrate:calibrate",
+    "decode": "robominer_slam.cli.decode:decode",
     "evaluate": "robominer_slam.cli.evaluate:evaluate",
     "graph": "robominer_slam.cli.graph:graph",
     "replay": "robominer_slam.cli.replay:replay",

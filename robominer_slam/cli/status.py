@@ -14,6 +14,8 @@ from drivers.ros_messages import deserialize
 from robominer_slam.publishing.report_messages import DIAGNOSTIC_ARRAY, Level
 from robominer_slam.publishing.zenoh_session import ZenohBus, ZenohSettings
 
+#: Keys of the whiskers that are not well, as `status_report.py` writes them: `whisker (row, column)`.
+WHISKER = "whisker "
 COLOURS = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "red", Level.STALE: "magenta"}
 
 
@@ -52,6 +54,20 @@ def status(connect: str, robot: str, timeout: float, as_json: bool) -> None:
         table.add_column(column)
     for entry in entries:
         level = Level(entry.level)
-        figures = "\n".join(f"{value.key} = {value.value}" for value in entry.values if value.value)
+        shown = [value for value in entry.values if value.value and not value.key.startswith(WHISKER)]
+        figures = "\n".join(f"{value.key} = {value.value}" for value in shown)
         table.add_row(entry.name, f"[{COLOURS[level]}]{level.name}[/]", entry.message, figures)
     Console().print(table)
+    unwell = [
+        (value.key.removeprefix(WHISKER).strip("()"), value.value)
+        for entry in entries
+        for value in entry.values
+        if value.key.startswith(WHISKER)
+    ]
+    if unwell:
+        whiskers = Table(title="whiskers left out of the map")
+        for column in ("row, column", "state"):
+            whiskers.add_column(column)
+        for place, state in unwell:
+            whiskers.add_row(place, state)
+        Console().print(whiskers)

@@ -51,7 +51,7 @@ def load_calibration(text: str, where: str, layout: WhiskerLayout) -> Calibratio
         CalibrationFileError: damaged, another version, another array.
     """
     calibration = from_text(text, where)
-    check_fits(calibration, layout=layout.name, rows=layout.rows, cols=layout.cols, where=where)
+    check_fits(calibration, layout=layout.name, rows=layout.rows, cols=layout.cols, where=where, p_base=layout.p_base)
     return calibration
 
 

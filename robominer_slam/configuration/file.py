@@ -14,6 +14,7 @@ from pydantic_core import ErrorDetails
 from tomlkit.items import Table
 
 from robominer_slam.configuration.model import Configuration
+from robominer_slam.configuration.parameter import Section
 
 
 class ConfigurationError(ValueError):
@@ -120,6 +121,8 @@ def _table(section: BaseModel, comments: bool) -> Table:
     table = tomlkit.table()
     for name, value in section:
         field = type(section).model_fields[name]
+        if isinstance(section, Section) and not section.concerns(name):
+            continue
         if isinstance(value, BaseModel):
             table.add(name, _table(value, comments))
         elif value is not None:

@@ -2,21 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal
 
-from pydantic import AfterValidator, Field, field_validator
+from pydantic import Field, field_validator
 
-from robominer_slam.configuration.parameter import Section, parameter
-
-
-def _one_key_chunk(value: str) -> str:
-    if not value or any(c in "/*$?# " for c in value):
-        raise ValueError("expected a name without spaces and without / * $ ? #")
-    return value
-
-
-#: A name that becomes one chunk of a Zenoh key.
-KeyChunk = Annotated[str, AfterValidator(_one_key_chunk)]
+from robominer_slam.configuration.device_section import DeviceSection
+from robominer_slam.configuration.parameter import KeyChunk, Section, parameter
 
 
 class RobotSection(Section):
@@ -26,23 +17,6 @@ class RobotSection(Section):
     layout: str = parameter("thesis-grid", "", "built-in name (thesis-grid, rm3) or path of a layout file")
     role: Literal["all", "drivers", "slam"] = parameter(
         "all", "", "drivers: devices to the network only; slam: from the network; all: both on one board"
-    )
-
-
-class DeviceSection(Section):
-    """One port and what is on it."""
-
-    name: KeyChunk = Field(description="the device's name in status, logs and keys", json_schema_extra={"unit": ""})
-    port: str = Field(description="path, usb:VID:PID[:SERIAL] or auto", json_schema_extra={"unit": ""})
-    protocol: Literal["framed"] = parameter("framed", "", "what the device speaks")
-    baud: int = parameter(115200, "bit/s", "the Arduino default; USB CDC devices ignore it", low=1200, high=12_000_000)
-    calibration: str | None = parameter(None, "", "calibration file of the whiskers on this device")
-    ticks_per_turn: int = parameter(4096, "1", "encoder ticks per turn of a screw", low=1, high=10_000_000)
-    mount_rpy_deg: tuple[float, float, float] = parameter(
-        (0.0, 0.0, 0.0), "deg", "rotation of the IMU in base_link: roll, pitch, yaw, applied yaw first"
-    )
-    acceleration: Literal["specific_force", "gravity_free"] = parameter(
-        "specific_force", "", "gravity_free where the IMU's driver has removed gravity already"
     )
 
 
@@ -68,6 +42,16 @@ class ContactSection(Section):
     )
     max_inclination_deg: float = parameter(
         70.0, "deg", "beyond this the rod lies along the surface and the tip assumption fails", low=20.0, high=85.0
+    )
+    flow_bend_deg: float = parameter(
+        10.0, "deg", "rods less inclined than this may be free in flowing water: 0.75 m/s bends them by 8 deg",
+        low=1.0, high=45.0,
+    )  # fmt: skip
+    flow_spread_deg: float = parameter(
+        1.8, "deg", "eddies and noise turn 98 % of free rods by less from their common bend", low=0.2, high=10.0
+    )
+    flow_whiskers: int = parameter(
+        5, "1", "rods that must agree for a flow; more than the whiskers of the array: never", low=2, high=100_000
     )
 
 
@@ -174,6 +158,69 @@ class SlamSection(Section):
     thesis: ThesisSection = Field(default_factory=ThesisSection)
 
 
+class HealthSection(Section):
+    """When a whisker is not believed, and how its rest position is followed (docs/calibration.md)."""
+
+    window: int = parameter(
+        18, "1", "frames looked at: at 25 a second, a fault is found within a second", low=5, high=1000
+    )
+    every: int = parameter(5, "1", "frames from one look to the next: a fifth of the cost", low=1, high=100)
+    dead_frames: int = parameter(
+        5, "1", "RM3's firmware takes five readings of zeros in a row for an error", low=2, high=1000
+    )
+    stuck_frames: int = parameter(
+        15, "1", "a reading repeats by chance once in 80 frames, 15 times never, even with half the noise",
+        low=3, high=1000,
+    )  # fmt: skip
+    saturation: float = parameter(129.0, "mT", "the TLV493D's range ends at 130 mT", low=1.0, high=1000.0)
+    noise: float = parameter(
+        1.2, "mT", "ten times a healthy sensor's 0.12; rods dragged over rough ground stay under 0.9",
+        low=0.1, high=50.0,
+    )  # fmt: skip
+    least_strength: float = parameter(
+        0.2, "1", "of the field at rest; a whole magnet bent by 75 deg still has 0.36", low=0.01, high=0.9
+    )
+    greatest_strength: float = parameter(
+        1.5, "1", "of the field at rest; no bend makes more than 1.1 of a whole magnet's", low=1.1, high=10.0
+    )
+    greatest_turn_deg: float = parameter(
+        80.0, "deg", "from the field at rest; a rod bent by 75 deg turns its field by 65", low=30.0, high=180.0
+    )
+    idle_deg: float = parameter(4.0, "deg", "as contact.min_inclination_deg", low=0.5, high=30.0)
+    bent_neighbours_deg: float = parameter(
+        12.0, "deg", "where all neighbours are bent by that, a whole rod between them is bent too", low=5.0, high=45.0
+    )
+    moved: float = parameter(
+        0.05, "m", "within the window: where the ground passes under it, no whole rod stays at rest",
+        low=0.005, high=1.0,
+    )  # fmt: skip
+    against: float = parameter(
+        0.6, "m", "after turning back, a rod trails again within its length of 0.15 m; at obstacles within 0.45",
+        low=0.1, high=10.0,
+    )  # fmt: skip
+    recovery: float = parameter(1.5, "s", "without a fault before a whisker is believed again", low=0.1, high=60.0)
+    rest_deg: float = parameter(
+        2.0, "deg", "a reading this near rest may be rest: half of the least contact angle", low=0.2, high=10.0
+    )
+    rest_noise_deg: float = parameter(
+        0.7, "deg", "standard deviation of a tilt at rest: the noise makes 0.5 deg", low=0.1, high=5.0
+    )
+    rest_distance: float = parameter(
+        0.05, "m", "the robot moves so far while the reading stays: ground would have moved the rod", low=0.01, high=1.0
+    )
+    rest_trail_deg: float = parameter(
+        0.3, "deg", "a mean tilt against the motion by more than this may be a tip that is dragged", low=0.05, high=5.0
+    )
+    rest_rate: float = parameter(
+        0.01, "deg/s", "fastest re-zeroing: ten times the drift of a warming robot, 3 deg an hour",
+        low=0.0, high=1.0,
+    )  # fmt: skip
+    drift_deg: float = parameter(
+        5.0, "deg", "a rest position that has crept so far from the calibrated one is no drift of a whole whisker",
+        low=1.0, high=30.0,
+    )  # fmt: skip
+
+
 class MapSection(Section):
     """The map as it is published."""
 
@@ -210,6 +257,7 @@ class Configuration(Section):
     device: tuple[DeviceSection, ...] = ()
     topics: TopicsSection = Field(default_factory=TopicsSection)
     contact: ContactSection = Field(default_factory=ContactSection)
+    health: HealthSection = Field(default_factory=HealthSection)
     screws: ScrewsSection = Field(default_factory=ScrewsSection)
     estimation: EstimationSection = Field(default_factory=EstimationSection)
     slam: SlamSection = Field(default_factory=SlamSection)

@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+
+def _one_key_chunk(value: str) -> str:
+    if not value or any(c in "/*$?# " for c in value):
+        raise ValueError("expected a name without spaces and without / * $ ? #")
+    return value
+
+
+#: A name that becomes one chunk of a Zenoh key.
+KeyChunk = Annotated[str, AfterValidator(_one_key_chunk)]
 
 
 class Section(BaseModel):
     """A section of the configuration file: unknown keys are refused, values never change after loading."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False, validate_default=True)
+
+    def concerns(self, _key: str) -> bool:
+        """Whether a key means something here; one that does not is left out where the configuration is printed."""
+        return True
 
 
 def parameter(

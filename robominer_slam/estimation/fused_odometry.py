@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from drivers.measurement import ImuSample, Measurement, ScrewAngles, ScrewSpeeds
 from robominer_slam.configuration.model import EstimationSection
 from robominer_slam.estimation.odometry_state import OdometryState
+from robominer_slam.estimation.screw_speeds import ScrewSpeedAssembly
 
 FloatArray = NDArray[np.float64]
 
@@ -90,6 +91,7 @@ class FusedOdometry:
         self._filter.P = np.diag([0.0, 0.0, 0.0, 1e-4, 1e-4, 1e-4, noise.sigma_gyro_bias_start**2])
         self._stamp_ns: int | None = None
         self._screws: ScrewAngles | None = None
+        self._speeds = ScrewSpeedAssembly()
         self._R_gyro = np.array([[noise.sigma_gyro**2]])
         self._R_screws = np.diag(np.square([noise.sigma_screws_vx, noise.sigma_screws_vy, noise.sigma_screws_wz]))
         self._slip = np.array([noise.screw_slip, noise.screw_slip, noise.screw_slip_turn])
@@ -104,15 +106,19 @@ class FusedOdometry:
                 self._filter.update(gyro[2:3], lambda _: H_GYRO, gyro_measurement, self._R_gyro)
             case ScrewAngles():
                 self._add_angles(measurement)
-            case ScrewSpeeds(speed=speed) if np.isfinite(speed).all():
-                self._predict(measurement.stamp_ns)
-                self._update_screws(speed)
+            case ScrewSpeeds():
+                speed = self._speeds.add(measurement)
+                if speed is not None:
+                    self._predict(measurement.stamp_ns)
+                    self._update_screws(speed)
             case _:
                 pass
 
     def measures_motion(self, measurement: Measurement) -> bool:
-        """The screws do; a gyro alone does not."""
-        return isinstance(measurement, ScrewAngles | ScrewSpeeds)
+        """The screws do, if all four are heard of; a gyro alone does not."""
+        if isinstance(measurement, ScrewSpeeds):
+            return bool(np.isfinite(measurement.speed).all()) or self._speeds.complete(measurement.stamp_ns)
+        return isinstance(measurement, ScrewAngles)
 
     def state_at(self, stamp_ns: int) -> OdometryState:
         """The state at a time that is not before the last measurement's."""
