@@ -3,13 +3,14 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types bench fuzz recordings clean venv
+.PHONY: demo test lint types bench fuzz soak recordings clean venv
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo    simulated robot + daemon + report, about three minutes"
 	@echo "make test    lint, types and tests, under eight minutes"
 	@echo "make bench   accuracy and speed tables (long)"
+	@echo "make soak    a device unplugged and replugged 200 times, two minutes"
 	@echo "make fuzz    ten million bytes of noise and damage for each decoder"
 	@echo "make recordings   the five scenarios as recordings, some minutes"
 
@@ -40,6 +41,9 @@ test: lint types
 
 bench: $(VENV)/.dev
 	$(BIN)/python benchmarks/pose_graph.py
+
+soak: $(VENV)/.dev
+	$(BIN)/python -m benchmarks.soak_hotplug
 
 fuzz: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.fuzz_decoders

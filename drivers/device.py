@@ -15,7 +15,7 @@ import numpy as np
 
 from drivers.counters import Counters
 from drivers.decoders import make_decoder
-from drivers.device_time import device_time
+from drivers.device_time import AskedTime, device_time
 from drivers.measurement import (
     SCREW_NAMES,
     FloatArray,
@@ -121,6 +121,13 @@ class Device:
     def to_send(self, now_ns: int) -> bytes:
         """What to write to the port now: what the protocol needs for time, or to start the device."""
         return b"" if self.state == "absent" else self.time.to_send(now_ns)
+
+    @property
+    def due_ns(self) -> int | None:
+        """When there is something to send to the nanosecond; None where it does not matter."""
+        if isinstance(self.time, AskedTime) and self.state not in ("absent", "probing"):
+            return self.time.due_ns
+        return None
 
     def check_silence(self, now_ns: int) -> None:
         """Report a device that is open but says nothing."""

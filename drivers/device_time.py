@@ -22,6 +22,10 @@ from drivers.settings import DeviceSettings
 FIRST_PINGS = 8
 FIRST_PING_INTERVAL_NS = 25_000_000
 PING_INTERVAL_NS = 1_000_000_000
+#: Intervals vary by this share either way. A device whose loop looks at its port every 10 ms, after it has sent, would
+#: answer regular pings with always the same delay, which no regression can see.
+PING_SPREAD = 0.3
+GOLDEN_RATIO = 0.6180339887
 #: A device that was told to stream and does not is told again this often.
 START_INTERVAL_NS = 1_000_000_000
 #: BNO08X: 100 Hz from an oscillator without a crystal where none is fitted: a few per cent.
@@ -102,12 +106,19 @@ class AskedTime:
         self._ping_count = 0
         self._next_ping_ns = now_ns
 
+    @property
+    def due_ns(self) -> int:
+        """When the next PING is to be sent, host's monotonic time."""
+        return self._next_ping_ns
+
     def to_send(self, now_ns: int) -> bytes:
         """A PING when one is due."""
         if now_ns < self._next_ping_ns:
             return b""
         quick = self._ping_count < FIRST_PINGS or not self.clock.synchronised
-        self._next_ping_ns = now_ns + (FIRST_PING_INTERVAL_NS if quick else PING_INTERVAL_NS)
+        interval = FIRST_PING_INTERVAL_NS if quick else PING_INTERVAL_NS
+        spread = 2.0 * (self._ping_count * GOLDEN_RATIO % 1.0) - 1.0
+        self._next_ping_ns = now_ns + round(interval * (1.0 + PING_SPREAD * spread))
         nonce = self._ping_count & 0xFFFFFFFF
         self._ping_count += 1
         # Answers that never came must not pile up.

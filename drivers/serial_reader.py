@@ -113,7 +113,7 @@ class SerialReader:
         if not self._selector.get_map():
             self._stop.wait(TICK_S)
         else:
-            for key, _ in self._selector.select(TICK_S):
+            for key, _ in self._selector.select(self._wait_s()):
                 self._read(key.data)
         now = time.monotonic_ns()
         for entry in self._ports:
@@ -123,6 +123,14 @@ class SerialReader:
             entry.device.check_silence(now)
             self._reset_if_wedged(entry, now)
             self._log_change(entry)
+
+    def _wait_s(self) -> float:
+        """Until the next ping is due: sent only when data wake this thread, pings would all meet the same delay."""
+        due = [entry.device.due_ns for entry in self._ports if entry.port is not None]
+        soonest = min((one for one in due if one is not None), default=None)
+        if soonest is None:
+            return TICK_S
+        return min(max((soonest - time.monotonic_ns()) * 1e-9, 0.0), TICK_S)
 
     def _open(self, entry: OpenPort) -> None:
         taken = frozenset(canonical(e.device.path) for e in self._ports if e.device.path is not None)
