@@ -6,7 +6,7 @@ thesis's tip assumption, section 3.1). A whisker that hangs at rest touches noth
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,26 @@ class Contacts:
     index: NDArray[np.intp]
     inclination: FloatArray
     azimuth: FloatArray
+
+
+def at_frame_start(contacts: Contacts, velocity: FloatArray, sensor_period_ns: int) -> Contacts:
+    """The contacts in base_link as it stood when the frame's first sensor was read.
+
+    Sensors are read one after the other, and the body moves meanwhile: 6 mm over a frame of 38 ms at 0.15 m/s. To the
+    first order, p(t_0) = p(t_k) + (t_k - t_0) (v + omega x p).
+
+    Args:
+        contacts: each in base_link at its own sensor's reading.
+        velocity: of the body: vx, vy (m/s), wz (rad/s), shape (3,).
+        sensor_period_ns: from one sensor's reading to the next, row-major.
+    """
+    if not sensor_period_ns or not len(contacts.index):
+        return contacts
+    later = contacts.index * (sensor_period_ns * 1e-9)
+    points = contacts.points.copy()
+    points[:, 0] += later * (velocity[0] - velocity[2] * contacts.points[:, 1])
+    points[:, 1] += later * (velocity[1] + velocity[2] * contacts.points[:, 0])
+    return replace(contacts, points=points)
 
 
 class ContactModel:

@@ -13,7 +13,7 @@ from calibration.angle_estimator import AngleEstimator
 from drivers.measurement import HallFrame, ImuSample, Measurement
 from drivers.spherical import cartesian_frame
 from robominer_slam import geometry
-from robominer_slam.contacts import ContactModel
+from robominer_slam.contacts import ContactModel, at_frame_start
 from robominer_slam.estimation.attitude_increments import AttitudeIncrements
 from robominer_slam.estimation.odometry_state import DeadReckoning, OdometryState
 from robominer_slam.frame_result import FrameResult, LocalizationState
@@ -143,6 +143,7 @@ class Pipeline:
         well, may_touch = self.monitor.judge(frame, angles, odometry, self.angle_estimator)
         angles = replace(angles, valid=well)
         contacts = self._contact_model.contacts(angles.inclination, angles.azimuth, may_touch)
+        contacts = at_frame_start(contacts, odometry.velocity, frame.sensor_period_ns)
         if len(contacts.index):
             self._contact_ns = stamp
         T_odom_base = planar_pose(odometry)

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from robominer_slam import layout as layouts
-from robominer_slam.contacts import ContactModel
+from robominer_slam.contacts import ContactModel, Contacts, at_frame_start
 from robominer_slam.layout import LayoutError, from_json, rm3, thesis_grid, to_json
 
 
@@ -66,6 +66,32 @@ def test_layout_file_round_trip():
     back = from_json(to_json(rm3()), "rm3.json")
     np.testing.assert_array_equal(back.p_base, rm3().p_base)
     np.testing.assert_array_equal(back.R_base_whisker, rm3().R_base_whisker)
+
+
+def test_contacts_of_a_frame_are_brought_to_the_time_of_its_first_sensor():
+    """Points that stand in the world, read one after the other from a body that drives and turns."""
+    rng = np.random.default_rng(0)
+    velocity, period_ns = np.array([0.15, -0.05, 0.4]), 600_000
+    index = np.array([0, 17, 40, 63])
+    world = rng.uniform(-0.25, 0.25, (4, 3))
+    # Pose of base_link at each sensor's reading, in that at the first one's, by small steps.
+    read = []
+    for k, point in zip(index, world, strict=True):
+        t, steps = k * period_ns * 1e-9, 2000
+        x = y = yaw = 0.0
+        for _ in range(steps):
+            dt = t / steps
+            x += dt * (np.cos(yaw) * velocity[0] - np.sin(yaw) * velocity[1])
+            y += dt * (np.sin(yaw) * velocity[0] + np.cos(yaw) * velocity[1])
+            yaw += dt * velocity[2]
+        c, s = np.cos(yaw), np.sin(yaw)
+        dx, dy = point[0] - x, point[1] - y
+        read.append([c * dx + s * dy, c * dy - s * dx, point[2]])
+    contacts = Contacts(np.array(read), index, np.zeros(4), np.zeros(4))
+    found = at_frame_start(contacts, velocity, period_ns)
+    np.testing.assert_allclose(found.points, world, atol=5e-5)
+    assert np.abs(contacts.points - world).max() > 3e-3
+    assert at_frame_start(contacts, velocity, 0) is contacts
 
 
 @pytest.mark.parametrize(
