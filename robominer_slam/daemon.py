@@ -15,6 +15,7 @@ from robominer_slam import status_report
 from robominer_slam.assembly import build_pipeline, build_slam
 from robominer_slam.calibrated_array import CalibratedArray
 from robominer_slam.commands import Commands
+from robominer_slam.configuration.devices import device_settings
 from robominer_slam.configuration.model import Configuration
 from robominer_slam.frame_result import FrameResult
 from robominer_slam.map_service import MapService
@@ -34,6 +35,8 @@ log = logging.getLogger(__name__)
 
 STATUS_INTERVAL_NS = 1_000_000_000
 TELEMETRY_INTERVAL_NS = 250_000_000
+#: What the operator is told where a device sends nothing, by what it carries.
+SILENT = {"whiskers": Health.WHISKERS_SILENT, "imu": Health.IMU_SILENT, "screws": Health.SCREWS_SILENT}
 #: How long the loop waits for a measurement before it looks whether it should end.
 WAIT_S = 0.1
 
@@ -56,6 +59,7 @@ class Daemon:
         self._store = store
         self._lock = threading.Lock()
         self._clock = WallClock()
+        self._carries = {one.name: one.carries for one in device_settings(configuration)}
         self._pipeline = build_pipeline(configuration, array.layout, array.model, "threaded")
         self._map = KeyframeMap(configuration.map.point_voxel)
         section = configuration.map
@@ -105,8 +109,11 @@ class Daemon:
         health = Health(0)
         if not result.angles.valid[self._layout.present].all():
             health |= Health.WHISKERS_FAULTY
-        if any(device.state != "streaming" for device in self._source.status()):
-            health |= Health.CLOCK_NOT_SYNCHRONISED
+        for device in self._source.status():
+            if device.state == "synchronising":
+                health |= Health.CLOCK_NOT_SYNCHRONISED
+            elif device.state != "streaming":
+                health |= SILENT.get(self._carries.get(device.name) or "", Health.FINE)
         if self._store.fault:
             health |= Health.STORE_FAILING
         if self._pipeline.paused:

@@ -104,3 +104,19 @@ def test_every_parameter_has_a_reason_a_unit_and_numbers_have_a_range():
             kinds = {type(m).__name__ for m in field.metadata}
             assert {"Ge", "Le"} <= kinds, f"{model.__name__}.{name} has no range"
             assert field.json_schema_extra["unit"], f"{model.__name__}.{name} has no unit"
+
+
+@pytest.mark.parametrize(
+    ("keys", "carries"),
+    [
+        ('name = "front"\nport = "auto"\nprotocol = "rm3-motor"', "screws"),
+        ('name = "attitude"\nport = "auto"\nprotocol = "mip"', "imu"),
+        ('name = "array"\nport = "auto"\nprotocol = "rm3-plaintext"', "whiskers"),
+        ('name = "array"\nport = "auto"\ncalibration = "a.json"', "whiskers"),
+        ('name = "imu"\nport = "auto"', "imu"),
+        ('name = "something"\nport = "auto"', None),
+    ],
+)
+def test_what_a_device_sends_is_told_by_calibration_protocol_or_name(keys, carries):
+    (settings,) = device_settings(parse(f"[[device]]\n{keys}\n", "test.toml"))
+    assert settings.carries == carries

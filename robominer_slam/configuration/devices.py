@@ -8,6 +8,14 @@ from drivers.settings import Carries, DeviceSettings
 from robominer_slam.configuration.device_section import DeviceSection
 from robominer_slam.configuration.model import Configuration
 
+SENT_BY_PROTOCOL: dict[str, Carries] = {
+    "rm3-plaintext": "whiskers",
+    "rm3-compressed": "whiskers",
+    "rm3-motor": "screws",
+    "bno08x-rvc": "imu",
+    "mip": "imu",
+}
+
 
 def device_settings(configuration: Configuration) -> list[DeviceSettings]:
     """The drivers' settings of every device."""
@@ -32,7 +40,9 @@ def device_settings(configuration: Configuration) -> list[DeviceSettings]:
 
 
 def _carries(device: DeviceSection) -> Carries | None:
-    """What a device sends, as far as its section says: by its calibration, or by its name."""
+    """What a device sends, as far as its section says: by its calibration, its protocol, or its name."""
     if device.calibration is not None:
         return "whiskers"
+    if device.protocol in SENT_BY_PROTOCOL:
+        return SENT_BY_PROTOCOL[device.protocol]
     return next((kind for kind in get_args(Carries) if kind == device.name), None)
