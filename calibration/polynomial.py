@@ -135,16 +135,11 @@ class PolynomialEvaluator:
         self._inverse_strength = 1.0 / strength
         self._coefficients = np.ascontiguousarray(model.coefficients.transpose(2, 1, 0))
         terms = model.coefficients.shape[1]
-        self._features = np.ones((terms, n))
-        # Monomials that begin with x, y, z are x, y, z times those of one degree less that begin with it or later.
-        self._steps: list[tuple[slice, slice, int]] = []
-        start, size = 0, 1
-        for degree in range(1, model.degree + 1):
-            end = write = start + size
-            for variable, count in enumerate((size, degree, 1)):
-                self._steps.append((slice(end - count, end), slice(write, write + count), variable))
-                write += count
-            start, size = end, write - end
+        # A monomial is a product of three powers, taken from a table: numpy's calls cost more than its products.
+        self._powers = np.ones((3, model.degree + 1, n))
+        exponent = _exponents(model.degree)
+        self._power_of = exponent + np.arange(3)[:, None] * (model.degree + 1)
+        self._features, self._factor = np.empty((terms, n)), np.empty((terms, n))
 
     def tilt(self, field_mT: FloatArray) -> FloatArray:
         """Tilt vectors, shape (2, n), rad, of one field reading per whisker, shape (n, 3), mT."""
@@ -155,8 +150,21 @@ class PolynomialEvaluator:
         transverse = np.sqrt(np.maximum(transverse_square, 1e-18))
         u[:2] *= np.arctan2(2.0 * transverse, u[2]) / transverse
         u[2] = strength * self._inverse_strength - 1.0
-        features = self._features
-        for source, target, variable in self._steps:
-            np.multiply(features[source], u[variable], out=features[target])
+        powers, features, factor = self._powers, self._features, self._factor
+        for degree in range(1, self._degree + 1):
+            np.multiply(powers[:, degree - 1], u, out=powers[:, degree])
+        flat = powers.reshape(-1, u.shape[1])
+        # "clip" writes into `out` directly; no index is ever outside.
+        np.take(flat, self._power_of[0], axis=0, out=features, mode="clip")
+        for one in self._power_of[1:]:
+            np.take(flat, one, axis=0, out=factor, mode="clip")
+            np.multiply(features, factor, out=features)
         tilt: FloatArray = np.einsum("otn,tn->on", self._coefficients, features)
         return tilt
+
+
+def _exponents(degree: int) -> NDArray[np.intp]:
+    """Exponents of x, y, z of all monomials up to a degree, in the order of `monomials`, shape (3, terms)."""
+    sizes = range(degree + 1)
+    each = [monomial for size in sizes for monomial in combinations_with_replacement(range(3), size)]
+    return np.array([[monomial.count(axis) for monomial in each] for axis in range(3)], dtype=np.intp)
