@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calibration.angle_estimator import AngleEstimator
-from calibration.fit import FitReport, fit_array
+from calibration.fit import Choice, FitReport, fit_array
 from calibration.magnet_model import fold
 from calibration.polynomial import PolynomialModel
 from calibration.samples import JigSamples, Samples
@@ -99,6 +99,9 @@ def figures(found: FloatArray) -> dict[str, float]:
     }
 
 
+MODELS: tuple[Choice, ...] = ("physical", "polynomial")
+
+
 def by_source(seeds: Sequence[int], frames: int) -> dict[str, dict[str, float]]:
     """Figures of every source and variant, all seeds together."""
     layout = thesis_grid()
@@ -116,8 +119,8 @@ def by_source(seeds: Sequence[int], frames: int) -> dict[str, dict[str, float]]:
                 "no neighbours": errors(replace(report.model, neighbours=None), hall, seed, frames),
                 "Earth too": errors(report.model, hall, seed, frames, earth=True),
             }
-            for choice in ("physical", "polynomial"):
-                alone = fit_array([samples], layout, choose=choice)  # type: ignore[arg-type]
+            for choice in MODELS:
+                alone = fit_array([samples], layout, choose=choice)
                 runs[f"{choice} alone"] = errors(alone.model, hall, seed, frames)
             if isinstance(samples, JigSamples):
                 folded = replace(samples, field_mT=fold(samples.field_mT))

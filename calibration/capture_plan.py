@@ -115,7 +115,16 @@ def plan_from_rows(method: Method, rows: Sequence[Mapping[str, str]], where: str
             raise CaptureError(f"{where}, line {line}: expected row and col, or neither of them")
         if is_rest and method == "jig":
             values.setdefault("azimuth_deg", 0.0)
-        step = CaptureStep(method, **values, **place)  # type: ignore[arg-type]
+        step = CaptureStep(
+            method,
+            inclination_deg=values.get("inclination_deg"),
+            azimuth_deg=values.get("azimuth_deg"),
+            height_m=values.get("height_m"),
+            direction_deg=values.get("direction_deg"),
+            dragged_m=values.get("dragged_m"),
+            row=place.get("row"),
+            col=place.get("col"),
+        )
         planned.append(PlannedStep(step, wait))
     if not any(one.step.is_rest for one in planned):
         raise CaptureError(f"{where}: no step at rest; begin with inclination_deg = 0")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 from serial.tools import list_ports
 
 from drivers.port_discovery import canonical
+
+if TYPE_CHECKING:
+    from usb.core import Device
 
 #: A device that is open but silent for this long is reset; it gets twice as long after each reset, up to the last.
 FIRST_RESET_NS = 5_000_000_000
@@ -26,7 +29,7 @@ def usb_port(path: str) -> tuple[int, int, str | None] | None:
     return None
 
 
-def reset(vendor: int, product: int, serial_number: str | None, backend: Any = None) -> None:  # noqa: ANN401
+def reset(vendor: int, product: int, serial_number: str | None, backend: object = None) -> None:
     """Reset a USB device, as unplugging it does.
 
     Args:
@@ -56,11 +59,12 @@ def reset(vendor: int, product: int, serial_number: str | None, backend: Any = N
             usb.util.dispose_resources(found[0])
     except usb.core.NoBackendError as error:
         raise UsbResetError("libusb is not installed") from error
+    # NotImplementedError is what a backend of pyusb raises that cannot reset.
     except (usb.core.USBError, NotImplementedError) as error:
         raise UsbResetError(f"refused: {error}") from error
 
 
-def _serial_number(device: Any) -> str | None:  # noqa: ANN401 - pyusb has no types
+def _serial_number(device: Device) -> str | None:
     try:
         number = device.serial_number
     except ValueError:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from typing import Any
+from typing import TYPE_CHECKING
 
 import matplotlib
 import mujoco
@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from robominer_slam.layout import WhiskerLayout
 from sim_backend.scene import World, WorldError
 from sim_backend.view_heights import ViewHeights
+
+if TYPE_CHECKING:
+    from mujoco.egl import GLContext
 
 # PyOpenGL tells at level INFO which accelerators it lacks.
 logging.getLogger("OpenGL").setLevel(logging.WARNING)
@@ -151,7 +154,7 @@ class SceneView:
         return geom
 
 
-def _off_screen(width: int, height: int) -> Any:  # noqa: ANN401 - MuJoCo's contexts have no common type
+def _off_screen(width: int, height: int) -> GLContext:
     """An OpenGL context that needs no display, made current.
 
     Raises:

@@ -19,15 +19,15 @@ from drivers import serial_reader
 from drivers.measurement import HallFrame, ImuSample
 from drivers.port_discovery import find_paths
 from drivers.serial_reader import SerialReader
-from drivers.settings import DeviceSettings
+from drivers.settings import Carries, DeviceSettings
 from drivers.usb_recovery import UsbResetError, reset
 from tests.test_serial_reader import FakeDevice, first, wait_for_state
 
 HALL = [(0x01, struct.pack("<BBHB12h", 2, 2, 600, 0x0F, *range(12)))]
 
 
-def settings(folder: Path, kind: str) -> DeviceSettings:
-    return DeviceSettings(kind, f"{folder}/tty*", carries=kind)  # type: ignore[arg-type]
+def settings(folder: Path, kind: Carries) -> DeviceSettings:
+    return DeviceSettings(kind, f"{folder}/tty*", carries=kind)
 
 
 def test_two_devices_on_one_pattern_are_not_mixed_up(tmp_path):
@@ -104,7 +104,7 @@ AUTO_IN_A_NAMESPACE = """
 import os, time
 from pathlib import Path
 from drivers.serial_reader import SerialReader
-from drivers.settings import DeviceSettings
+from drivers.settings import Carries, DeviceSettings
 from tests.test_hotplug import HALL
 from tests.test_serial_reader import FakeDevice, first, wait_for_state
 from drivers.measurement import HallFrame, ImuSample

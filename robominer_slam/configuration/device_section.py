@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import Field, model_validator
 
@@ -68,7 +68,7 @@ class DeviceSection(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _mip_points_down(cls, data: Any) -> Any:  # noqa: ANN401 - whatever the file holds
+    def _mip_points_down(cls, data: object) -> object:
         if isinstance(data, dict) and data.get("protocol") == "mip" and "mount_rpy_deg" not in data:
             return {**data, "mount_rpy_deg": MIP_MOUNT_RPY_DEG}
         return data
