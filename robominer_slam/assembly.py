@@ -12,9 +12,11 @@ from calibration.polynomial import PolynomialModel
 from robominer_slam import geometry
 from robominer_slam.configuration.model import Configuration
 from robominer_slam.contacts import ContactModel
+from robominer_slam.estimation.drag_direction import DragDirection
 from robominer_slam.estimation.fused_odometry import FusedOdometry
 from robominer_slam.estimation.integrated_odometry import IntegratedOdometry
 from robominer_slam.estimation.odometry_state import DeadReckoning
+from robominer_slam.estimation.robust_odometry import RobustOdometry
 from robominer_slam.estimation.screw_kinematics import forward_matrix
 from robominer_slam.flow_bend import FlowBend
 from robominer_slam.layout import WhiskerLayout
@@ -37,7 +39,7 @@ def build_pipeline(
     composite, runner = build_slam(configuration, execution)
     contact = configuration.contact
     return Pipeline(
-        dead_reckoning=_dead_reckoning(configuration),
+        dead_reckoning=_dead_reckoning(configuration, layout),
         angle_estimator=AngleEstimator(model),
         monitor=WhiskerMonitor(
             WhiskerHealth(configuration.health, layout, model.rest_mT, model.fitted, folded=model.folded),
@@ -61,7 +63,7 @@ def build_pipeline(
 def build_slam(configuration: Configuration, execution: Execution) -> tuple[CompositeScan | None, BackendRunner | None]:
     """The method's front-end and back-end, fresh; nothing for odometry alone."""
     slam = configuration.slam
-    if slam.method == "none":
+    if slam.method != "thesis":
         return None, None
     thesis = slam.thesis
     composite = CompositeScan(thesis.keyframe_distance, thesis.keyframe_angle, thesis.scan_voxel)
@@ -72,9 +74,21 @@ def build_slam(configuration: Configuration, execution: Execution) -> tuple[Comp
     return composite, SynchronousRunner(backend, latency_ns)
 
 
-def _dead_reckoning(configuration: Configuration) -> DeadReckoning:
+def build_robust_odometry(configuration: Configuration, layout: WhiskerLayout) -> RobustOdometry:
+    """The dead reckoning of the method `robust`, at its start."""
+    settings = configuration.robust_estimation
+    drag = DragDirection(settings, layout) if settings.drag else None
+    return RobustOdometry(settings, configuration.estimation.source, drag, _screw_matrix(configuration))
+
+
+def _dead_reckoning(configuration: Configuration, layout: WhiskerLayout) -> DeadReckoning:
+    if configuration.slam.method == "robust":
+        return build_robust_odometry(configuration, layout)
     if configuration.estimation.source == "odometry":
         return IntegratedOdometry()
+    return FusedOdometry(configuration.estimation, _screw_matrix(configuration))
+
+
+def _screw_matrix(configuration: Configuration) -> FloatArray:
     screws = configuration.screws
-    matrix = forward_matrix(screws.radius, np.deg2rad(screws.helix_angle_deg), screws.half_track, screws.half_base)
-    return FusedOdometry(configuration.estimation, matrix)
+    return forward_matrix(screws.radius, np.deg2rad(screws.helix_angle_deg), screws.half_track, screws.half_base)

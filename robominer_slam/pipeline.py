@@ -15,7 +15,7 @@ from drivers.spherical import cartesian_frame
 from robominer_slam import geometry
 from robominer_slam.contacts import ContactModel, at_frame_start
 from robominer_slam.estimation.attitude_increments import AttitudeIncrements
-from robominer_slam.estimation.odometry_state import DeadReckoning, OdometryState
+from robominer_slam.estimation.odometry_state import DeadReckoning, FeelsMotion, OdometryState
 from robominer_slam.frame_result import FrameResult, LocalizationState
 from robominer_slam.reorder import ReorderBuffer
 from robominer_slam.slam.backend_runner import BackendRunner
@@ -146,6 +146,9 @@ class Pipeline:
         contacts = at_frame_start(contacts, odometry.velocity, frame.sensor_period_ns)
         if len(contacts.index):
             self._contact_ns = stamp
+        if isinstance(self._dead_reckoning, FeelsMotion):
+            self._dead_reckoning.add_contacts(stamp, contacts)
+            odometry = self._dead_reckoning.state_at(stamp)
         T_odom_base = planar_pose(odometry)
         backend_results = self.runner.due(stamp) if self.runner is not None else []
         for result in backend_results:
@@ -221,5 +224,7 @@ class Pipeline:
 
 
 def planar_pose(state: OdometryState) -> FloatArray:
-    """Pose of base_link in odom, shape (4, 4)."""
+    """Pose of base_link in odom, shape (4, 4): in space where it is known so, else in the plane."""
+    if state.T_odom_base is not None:
+        return state.T_odom_base
     return geometry.T_from_xyyaw([state.x, state.y, state.yaw])

@@ -8,6 +8,7 @@ from pydantic import Field, field_validator
 
 from robominer_slam.configuration.device_section import DeviceSection
 from robominer_slam.configuration.parameter import KeyChunk, Section, parameter
+from robominer_slam.configuration.robust_estimation_section import RobustEstimationSection
 
 
 class RobotSection(Section):
@@ -147,7 +148,9 @@ class ThesisSection(Section):
 class SlamSection(Section):
     """Simultaneous localisation and mapping."""
 
-    method: Literal["thesis", "none"] = parameter("thesis", "", "thesis: its pipeline; none: odometry alone")
+    method: Literal["robust", "thesis", "none"] = parameter(
+        "thesis", "", "robust: this project's; thesis: its pipeline; none: odometry alone"
+    )
     backend_latency: float = parameter(
         0.5, "s", "a keyframe's result takes effect this long after it, in sensor time, so that replay equals run",
         low=0.0, high=60.0,
@@ -260,6 +263,7 @@ class Configuration(Section):
     health: HealthSection = Field(default_factory=HealthSection)
     screws: ScrewsSection = Field(default_factory=ScrewsSection)
     estimation: EstimationSection = Field(default_factory=EstimationSection)
+    robust_estimation: RobustEstimationSection = Field(default_factory=RobustEstimationSection)
     slam: SlamSection = Field(default_factory=SlamSection)
     map: MapSection = Field(default_factory=MapSection)
     store: StoreSection = Field(default_factory=StoreSection)

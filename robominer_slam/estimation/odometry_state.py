@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.measurement import Measurement
+from robominer_slam.contacts import Contacts
 
 FloatArray = NDArray[np.float64]
 
@@ -19,10 +20,12 @@ class OdometryState:
 
     Attributes:
         stamp_ns: the time it holds for.
-        x, y, yaw: pose in odom, m and rad; the body is level: z, roll and pitch are zero.
+        x, y, yaw: pose in odom, m and rad.
         velocity: body velocity vx, vy (m/s), wz (rad/s), shape (3,).
         covariance: of (x, y, yaw) in odom, shape (3, 3).
         velocity_covariance: of the velocity, shape (3, 3).
+        T_odom_base: pose in odom with z, roll and pitch, shape (4, 4); None where the body is taken as level.
+        pose_covariance: of x, y, z, roll, pitch, yaw in odom, shape (6, 6); None likewise.
     """
 
     stamp_ns: int
@@ -32,6 +35,8 @@ class OdometryState:
     velocity: FloatArray
     covariance: FloatArray
     velocity_covariance: FloatArray
+    T_odom_base: FloatArray | None = None
+    pose_covariance: FloatArray | None = None
 
 
 class DeadReckoning(Protocol):
@@ -47,4 +52,13 @@ class DeadReckoning(Protocol):
 
     def state_at(self, stamp_ns: int) -> OdometryState:
         """The state at a time that is not before the last measurement's."""
+        ...
+
+
+@runtime_checkable
+class FeelsMotion(Protocol):
+    """Dead reckoning that takes the whiskers' contacts too."""
+
+    def add_contacts(self, stamp_ns: int, contacts: Contacts) -> None:
+        """Take the contacts of a whisker frame, in base_link; `state_at` then knows of them."""
         ...
