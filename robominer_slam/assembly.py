@@ -24,6 +24,10 @@ from robominer_slam.pipeline import Pipeline
 from robominer_slam.rest_tracking import RestTracker
 from robominer_slam.slam.backend_runner import BackendRunner, SynchronousRunner, ThreadedRunner
 from robominer_slam.slam.composite_scan import CompositeScan
+from robominer_slam.slam.keyframe import Backend
+from robominer_slam.slam.robust import RobustBackend
+from robominer_slam.slam.scan_odometry import ScanOdometry
+from robominer_slam.slam.surface import SurfaceModel
 from robominer_slam.slam.thesis import ThesisBackend
 from robominer_slam.whisker_health import WhiskerHealth
 from robominer_slam.whisker_monitor import WhiskerMonitor
@@ -51,6 +55,7 @@ def build_pipeline(
         ),
         composite_scan=composite,
         runner=runner,
+        scan_odometry=build_scan_odometry(configuration, layout),
         imu_mounts={
             device.name: geometry.matrix_from_rpy(np.deg2rad(device.mount_rpy_deg))
             for device in configuration.device
@@ -63,15 +68,33 @@ def build_pipeline(
 def build_slam(configuration: Configuration, execution: Execution) -> tuple[CompositeScan | None, BackendRunner | None]:
     """The method's front-end and back-end, fresh; nothing for odometry alone."""
     slam = configuration.slam
-    if slam.method != "thesis":
-        return None, None
-    thesis = slam.thesis
-    composite = CompositeScan(thesis.keyframe_distance, thesis.keyframe_angle, thesis.scan_voxel)
-    backend = ThesisBackend(thesis)
+    backend: Backend
+    match slam.method:
+        case "none":
+            return None, None
+        case "thesis":
+            thesis = slam.thesis
+            composite = CompositeScan(thesis.keyframe_distance, thesis.keyframe_angle, thesis.scan_voxel)
+            backend = ThesisBackend(thesis)
+        case "robust":
+            composite = CompositeScan(slam.robust.keyframe_distance, slam.robust.keyframe_angle, 0.0)
+            backend = RobustBackend(slam.robust)
     latency_ns = round(slam.backend_latency * 1e9)
     if execution == "threaded":
         return composite, ThreadedRunner(backend, latency_ns, slam.backend_queue)
     return composite, SynchronousRunner(backend, latency_ns)
+
+
+def build_scan_odometry(configuration: Configuration, layout: WhiskerLayout) -> ScanOdometry | None:
+    """Scan matching, for the method that has it."""
+    robust = configuration.slam.robust
+    if configuration.slam.method != "robust" or not robust.scan_matching.enabled:
+        return None
+    s = robust.surface
+    reach = float((np.abs(layout.p_base[:, :2]).max(axis=1) + layout.length).max()) + 0.1
+    return ScanOdometry(
+        robust.scan_matching, SurfaceModel(s.touch_sigma, s.curvature, s.slope_sigma, s.reach), reach
+    )
 
 
 def build_robust_odometry(configuration: Configuration, layout: WhiskerLayout) -> RobustOdometry:

@@ -15,18 +15,28 @@ from drivers.spherical import cartesian_frame
 from robominer_slam import geometry
 from robominer_slam.contacts import ContactModel, at_frame_start
 from robominer_slam.estimation.attitude_increments import AttitudeIncrements
-from robominer_slam.estimation.odometry_state import DeadReckoning, FeelsMotion, OdometryState
+from robominer_slam.estimation.odometry_state import (
+    DeadReckoning,
+    FeelsMotion,
+    OdometryState,
+    TakesScanMatches,
+    TellsMotion,
+)
 from robominer_slam.frame_result import FrameResult, LocalizationState
 from robominer_slam.reorder import ReorderBuffer
 from robominer_slam.slam.backend_runner import BackendRunner
 from robominer_slam.slam.composite_scan import CompositeScan
 from robominer_slam.slam.keyframe import BackendResult, Keyframe
+from robominer_slam.slam.robust import levelled
+from robominer_slam.slam.scan_odometry import ScanOdometry
 from robominer_slam.whisker_monitor import WhiskerMonitor
 
 FloatArray = NDArray[np.float64]
 
 #: Without contacts for this long there is nothing to localise on.
 BLIND_NS = 2_000_000_000
+#: How well the height is known from one match to the next.
+HEIGHT_SIGMA_M = 0.002
 #: Without odometry for this long the robot may be anywhere near: the pose is not known.
 ODOMETRY_TIMEOUT_NS = 2_000_000_000
 
@@ -55,6 +65,7 @@ class Pipeline:
         runner: BackendRunner | None,
         imu_mounts: Mapping[str, FloatArray],
         reorder_window_ns: int,
+        scan_odometry: ScanOdometry | None = None,
     ) -> None:
         self.reorder = ReorderBuffer(reorder_window_ns)
         self.angle_estimator = angle_estimator
@@ -67,6 +78,7 @@ class Pipeline:
         self._contact_model = contact_model
         self._composite = composite_scan
         self._imu_mounts = imu_mounts
+        self._scan_odometry = scan_odometry
         self._T_map_odom = np.eye(4)
         self._last_result: BackendResult | None = None
         self._odometry_at_result: FloatArray | None = None
@@ -149,6 +161,7 @@ class Pipeline:
         if isinstance(self._dead_reckoning, FeelsMotion):
             self._dead_reckoning.add_contacts(stamp, contacts)
             odometry = self._dead_reckoning.state_at(stamp)
+        odometry = self._matched(stamp, odometry, contacts.points)
         T_odom_base = planar_pose(odometry)
         backend_results = self.runner.due(stamp) if self.runner is not None else []
         for result in backend_results:
@@ -170,6 +183,24 @@ class Pipeline:
             backend_results=backend_results,
         )
 
+    def _matched(self, stamp: int, odometry: OdometryState, points: FloatArray) -> OdometryState:
+        """The odometry after matching the scan with the ground touched lately."""
+        scans, reckoning = self._scan_odometry, self._dead_reckoning
+        if scans is None or not isinstance(reckoning, TakesScanMatches):
+            return odometry
+        level, tilt = levelled(planar_pose(odometry))
+        points = points @ tilt.T
+        covariance = np.zeros((4, 4))
+        covariance[:3, :3] = reckoning.relative_covariance()
+        covariance[3, 3] = HEIGHT_SIGMA_M**2
+        correction = scans.match(level, covariance, points)
+        if correction is not None:
+            reckoning.correct_pose(stamp, correction.offset, correction.information)
+            odometry = reckoning.state_at(stamp)
+            level, _ = levelled(planar_pose(odometry))
+        scans.add(level, points)
+        return odometry
+
     def _keyframe(
         self, stamp: int, T_odom_base: FloatArray, points: FloatArray, odometry: OdometryState
     ) -> Keyframe | None:
@@ -177,6 +208,8 @@ class Pipeline:
             return None
         keyframe = self._composite.add(stamp, T_odom_base, points)
         if keyframe is not None:
+            if isinstance(self._dead_reckoning, TellsMotion):
+                keyframe = replace(keyframe, motion=self._dead_reckoning.mark_keyframe(stamp))
             self._odometry_of_keyframe[keyframe.id] = odometry.covariance
             if keyframe.id == 0:
                 self._first_keyframe_covariance = odometry.covariance

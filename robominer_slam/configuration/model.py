@@ -9,6 +9,7 @@ from pydantic import Field, field_validator
 from robominer_slam.configuration.device_section import DeviceSection
 from robominer_slam.configuration.parameter import KeyChunk, Section, parameter
 from robominer_slam.configuration.robust_estimation_section import RobustEstimationSection
+from robominer_slam.configuration.robust_slam_section import RobustSlamSection
 
 
 class RobotSection(Section):
@@ -159,6 +160,7 @@ class SlamSection(Section):
         16, "1", "keyframes that may wait for the back-end; beyond, the front-end waits", low=1, high=1000
     )
     thesis: ThesisSection = Field(default_factory=ThesisSection)
+    robust: RobustSlamSection = Field(default_factory=RobustSlamSection)
 
 
 class HealthSection(Section):

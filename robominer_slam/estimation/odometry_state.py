@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from drivers.measurement import Measurement
 from robominer_slam.contacts import Contacts
+from robominer_slam.estimation.keyframe_motion import KeyframeMotion
 
 FloatArray = NDArray[np.float64]
 
@@ -61,4 +62,26 @@ class FeelsMotion(Protocol):
 
     def add_contacts(self, stamp_ns: int, contacts: Contacts) -> None:
         """Take the contacts of a whisker frame, in base_link; `state_at` then knows of them."""
+        ...
+
+
+@runtime_checkable
+class TellsMotion(Protocol):
+    """Dead reckoning that tells the noise of the motion between keyframes from its biases."""
+
+    def mark_keyframe(self, stamp_ns: int) -> KeyframeMotion:
+        """Motion since the last mark (or the start); the present pose becomes the new reference."""
+        ...
+
+
+@runtime_checkable
+class TakesScanMatches(Protocol):
+    """Dead reckoning that scan matching can correct."""
+
+    def correct_pose(self, stamp_ns: int, offset: FloatArray, information: FloatArray) -> None:
+        """Take what a scan match says of (x, y, yaw) in odom: offset, shape (3,), and its information (3, 3)."""
+        ...
+
+    def relative_covariance(self) -> FloatArray:
+        """Covariance of (x, y, yaw) since the last keyframe, in odom, shape (3, 3)."""
         ...

@@ -26,6 +26,7 @@ from robominer_slam.estimation.keyframe_motion import KeyframeMotion
 from robominer_slam.estimation.odometry_state import OdometryState
 from robominer_slam.estimation.planar_motion import (
     GYRO_BIAS,
+    KEY_YAW,
     REL,
     SLOW,
     VELOCITY,
@@ -49,6 +50,8 @@ MAX_INTERVAL_S = 0.5
 #: States of the sources after the common nine.
 ODOMETRY_BIAS = slice(SLOW, SLOW + 3)
 SLIP_MEAN, SLIP = slice(SLOW + 1, SLOW + 4), slice(SLOW + 4, SLOW + 7)
+#: Less information about a direction, 1/m2 or 1/rad2, is none.
+LEAST_INFORMATION = 1.0
 #: Velocity at the start may be anything a robot does.
 SIGMA_START = np.array([0.01, 0.01, 0.01])
 #: More slip than this is a robot that is stuck: the model ends there.
@@ -205,6 +208,35 @@ class RobustOdometry:
         )
         self._filter.keyframe()
         return motion
+
+    def correct_pose(self, stamp_ns: int, offset: FloatArray, information: FloatArray) -> None:
+        """Take what a scan match says of the pose since the last keyframe.
+
+        Args:
+            stamp_ns: time of the scan.
+            offset: of (x, y, yaw) in odom, measured less predicted, shape (3,).
+            information: of it, shape (3, 3); directions without information are left alone.
+        """
+        self._predict(stamp_ns)
+        x = self._filter.x
+        c, s = math.cos(x[KEY_YAW]), math.sin(x[KEY_YAW])
+        to_key = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        values, vectors = np.linalg.eigh(to_key @ information @ to_key.T)
+        told = values > LEAST_INFORMATION
+        if not told.any():
+            return
+        rows = vectors[:, told].T
+        H = np.zeros((len(rows), len(x)))
+        H[:, REL] = rows
+        self._filter.correct(rows @ (to_key @ offset), H, np.diag(1.0 / values[told]))
+
+    def relative_covariance(self) -> FloatArray:
+        """Covariance of (x, y, yaw) since the last keyframe, in odom, shape (3, 3)."""
+        x, P = self._filter.x, self._filter.P
+        c, s = math.cos(x[KEY_YAW]), math.sin(x[KEY_YAW])
+        to_odom = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        covariance: FloatArray = to_odom @ P[REL, REL] @ to_odom.T
+        return covariance
 
     @property
     def bias(self) -> FloatArray:

@@ -9,6 +9,8 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from robominer_slam.estimation.keyframe_motion import KeyframeMotion
+
 FloatArray = NDArray[np.float64]
 
 
@@ -22,6 +24,7 @@ class Keyframe:
         T_odom_base: pose of base_link in odom at that time, shape (4, 4).
         points: contact points in base_link at that time, shape (m, 3), m.
         travelled: distance driven by odometry up to here, m.
+        motion: since the keyframe before, where the dead reckoning tells its noise and biases apart.
     """
 
     id: int
@@ -29,6 +32,7 @@ class Keyframe:
     T_odom_base: FloatArray
     points: FloatArray
     travelled: float
+    motion: KeyframeMotion | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,223 @@
+"""Looks for one keyframe's place on ground touched long before: where, how surely, and whether nowhere else.
+
+The target is a pass: keyframes of one earlier drive over this ground, merged into one surface, since small patches
+fit falsely in many places. The search covers the whole uncertainty of the prediction at once (`correlative_search`);
+its best place is refined (`surface_registration`), and judged: overlap, residuals, contrast of the ground, distance
+in cost to the next best place, and whether every direction is constrained. No figure of these depends on the world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robominer_slam import geometry
+from robominer_slam.configuration.robust_slam_section import ClosureSection
+from robominer_slam.slam.correlative_search import SearchGrid, grid_around, search
+from robominer_slam.slam.surface import Surface, SurfaceModel
+from robominer_slam.slam.surface_registration import YAW, SurfaceMatch, X, Y, Z, fit, placed
+
+FloatArray = NDArray[np.float64]
+
+#: Deviation of the common height in a match, m: odometry knows it better than any search must.
+HEIGHT_SIGMA = 0.01
+#: Times that planes are looked up anew in the refinement.
+ASSOCIATIONS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Closure:
+    """A place found for a keyframe, with what it was judged by.
+
+    Attributes:
+        i, j: ids of the anchor (in the target) and of the new keyframe.
+        Z: pose of j in i: x, y (m), heading (rad), shape (3,).
+        covariance: of it, as a twist in j's frame, shape (3, 3).
+        dz: height of j over i, m.
+        match: the refined match.
+        uniqueness: cost of the next best place over that of this one.
+        moved: Mahalanobis distance of Z from the prediction.
+        good: whether it passed every check.
+    """
+
+    i: int
+    j: int
+    Z: FloatArray
+    covariance: FloatArray
+    dz: float
+    match: SurfaceMatch
+    uniqueness: float
+    moved: float
+    good: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """Touches in the level frame of the keyframe that they were gathered at.
+
+    Attributes:
+        points: shape (m, 3), m.
+        travelled: way driven up to it, m.
+    """
+
+    points: FloatArray
+    travelled: float
+
+
+class ClosureSearch:
+    """Finds closures; holds no map of its own.
+
+    Args:
+        parameters: with units and reasons there.
+        model: how touches make a surface.
+    """
+
+    def __init__(self, parameters: ClosureSection, model: SurfaceModel) -> None:
+        self._parameters = parameters
+        self._model = model
+
+    def passes(
+        self, new: int, patches: Mapping[int, Patch], poses: Mapping[int, FloatArray], reach: float
+    ) -> list[list[int]]:
+        """Earlier keyframes near the predicted place, by drives over it, nearest first; each in the order of ids.
+
+        Args:
+            new: id of the keyframe to be placed.
+            patches: touches by keyframe.
+            poses: x, y, heading by keyframe, in map.
+            reach: how far the prediction may be off, m.
+        """
+        parameters = self._parameters
+        ids = np.array(sorted(patches), dtype=np.int64)
+        travelled = np.array([patches[k].travelled for k in ids])
+        xy = np.array([poses[k][:2] for k in ids])
+        distance = np.hypot(*(xy - poses[new][:2]).T)
+        old = travelled <= patches[new].travelled - parameters.min_travel
+        near = np.flatnonzero(old & (distance <= parameters.target_radius + reach))
+        if not len(near):
+            return []
+        runs = np.split(near, np.flatnonzero(np.diff(travelled[near]) > 2.0 * parameters.target_radius) + 1)
+        runs.sort(key=lambda run: float(distance[run].min()))
+        return [[int(k) for k in ids[run]] for run in runs[: parameters.max_targets]]
+
+    def find(
+        self,
+        source: FloatArray,
+        new: int,
+        targets: Sequence[int],
+        patches: Mapping[int, Patch],
+        poses: Mapping[int, FloatArray],
+        dz: float,
+        prediction: FloatArray,
+        covariance: FloatArray,
+        anchor: int,
+    ) -> Closure | None:
+        """Search one pass; None if nothing overlaps enough.
+
+        Args:
+            source: touches in the new keyframe's level frame, shape (m, 3), m.
+            new: its id.
+            targets: ids of the pass.
+            patches, poses: as of `passes`.
+            dz: predicted height of the new keyframe over the anchor, m.
+            prediction: pose of the new keyframe in the anchor, shape (3,).
+            covariance: of it, as a twist in the new keyframe's frame, shape (3, 3).
+            anchor: the target's frame: one of `targets`.
+        """
+        parameters = self._parameters
+        T = geometry.se2_inverse(poses[anchor])
+        target = np.concatenate(
+            [placed(patches[k].points, np.append(geometry.se2_compose(T, poses[k]), 0.0)) for k in targets]
+        )
+        points = _thinned(source, parameters.points)
+        points = points + np.array([0.0, 0.0, dz])
+        c, s = np.cos(prediction[YAW]), np.sin(prediction[YAW])
+        R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        prior = R @ covariance @ R.T
+        half = self._window(prior)
+        reach = np.hypot(points[:, 0], points[:, 1]).max() + half[:2] + 3.0 * parameters.cell
+        low, high = prediction[:2] - reach, prediction[:2] + reach
+        inside = ((target[:, :2] >= low) & (target[:, :2] <= high)).all(axis=1)
+        if int(inside.sum()) < len(points) * parameters.min_overlap:
+            return None
+        target = target[inside]
+        origin, shape = grid_around(low, high, parameters.cell)
+        found = search(
+            SearchGrid(target, origin, shape, parameters.cell),
+            points,
+            prediction,
+            half,
+            np.deg2rad(parameters.yaw_step_deg),
+            parameters.min_overlap,
+            (self._model.touch_sigma / HEIGHT_SIGMA) ** 2 * 10.0,
+        )
+        if not len(found.poses):
+            return None
+        unique = float(found.cost[1] / max(found.cost[0], 1e-12)) if len(found.cost) > 1 else np.inf
+        height_prior = np.zeros((4, 4))
+        height_prior[Z, Z] = 1.0 / HEIGHT_SIGMA**2
+        guess = np.append(found.poses[0], 0.0)
+        match = fit(Surface(target, self._model), points, guess, height_prior, ASSOCIATIONS)
+        return self._judged(match, unique, prediction, prior, half, new, anchor, dz)
+
+    def _window(self, prior: FloatArray) -> FloatArray:
+        """Half size of the search in x, y and heading."""
+        p = self._parameters
+        sigma = p.sigmas * np.sqrt(np.diag(prior))
+        low = np.array([p.min_window, p.min_window, np.deg2rad(p.min_yaw_window_deg)])
+        high = np.array([p.max_window, p.max_window, np.deg2rad(p.max_yaw_window_deg)])
+        return np.clip(sigma, low, high)
+
+    def _judged(
+        self,
+        match: SurfaceMatch,
+        unique: float,
+        prediction: FloatArray,
+        prior: FloatArray,
+        half: FloatArray,
+        new: int,
+        anchor: int,
+        dz: float,
+    ) -> Closure:
+        p = self._parameters
+        H = match.information
+        planar = H[:3, :3] - np.outer(H[:3, Z], H[Z, :3]) / max(H[Z, Z], 1e-12)
+        floor = np.square([p.floor, p.floor, np.deg2rad(p.floor_yaw_deg)])
+        covariance = p.inflation * np.linalg.pinv(planar, rcond=1e-12, hermitian=True) + np.diag(floor)
+        least = np.linalg.eigvalsh(planar)[0]
+        off = match.pose[:3] - prediction
+        off[YAW] = geometry.wrap_angle(off[YAW])
+        moved = float(np.sqrt(off @ np.linalg.solve(prior + covariance, off)))
+        good = (
+            match.overlap >= p.min_overlap
+            and match.inliers >= p.min_inliers
+            and match.relief >= p.min_contrast * match.rms
+            and unique >= p.uniqueness
+            and least > 0.0
+            and float(np.linalg.eigvalsh(covariance[:2, :2])[-1]) <= p.max_sigma**2
+            and covariance[YAW, YAW] <= np.deg2rad(p.max_sigma_yaw_deg) ** 2
+            and bool((np.abs(off) <= half + np.array([0.05, 0.05, 0.1])).all())
+        )
+        c, s = np.cos(match.pose[YAW]), np.sin(match.pose[YAW])
+        R = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        return Closure(
+            anchor,
+            new,
+            np.array([match.pose[X], match.pose[Y], match.pose[YAW]]),
+            R @ covariance @ R.T,
+            dz + float(match.pose[Z]),
+            match,
+            unique,
+            moved,
+            good,
+        )
+
+
+def _thinned(points: FloatArray, count: int) -> FloatArray:
+    """About `count` of the points, evenly along their order."""
+    if len(points) <= count:
+        return points
+    return points[np.linspace(0, len(points) - 1, count).astype(np.int64)]

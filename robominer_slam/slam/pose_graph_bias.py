@@ -1,0 +1,200 @@
+"""Least squares over planar poses and the slow biases of the odometry that joins them.
+
+An odometry edge measures T_i_j = Z Exp(B (b - b0)), with b the biases that last the whole drive, B what they do to
+this edge and b0 the values that Z was made with. With a prior on b, Gauss-Newton solves
+
+    [ H_xx  H_xb ] [dx]     [g_x]
+    [ H_bx  H_bb ] [db] = - [g_b],
+
+where H_xx is the sparse matrix of `pose_graph_system` and the bias's few columns are eliminated first (a Schur
+complement): one factorisation serves all of them. Errors e = Log(Z(b)^-1 X_i^-1 X_j); de/db = -B to first order in e.
+
+Sources: Grisetti et al., "A tutorial on graph-based SLAM" (2010); Forster et al., "On-manifold preintegration" (T-RO
+2017), section VI-C, for edges with a first-order bias correction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.linalg import SuperLU
+
+from robominer_slam import geometry
+from robominer_slam.slam import pose_graph_residuals as residuals
+from robominer_slam.slam.pose_graph_optimizer import EdgeCosts, Kernels, edge_costs, normal_equations
+from robominer_slam.slam.pose_graph_residuals import EdgeArrays
+from robominer_slam.slam.pose_graph_system import SystemPattern
+
+FloatArray = NDArray[np.float64]
+
+_STEP_LENGTHS = tuple(0.5**k for k in range(10))
+
+
+@dataclass(frozen=True, slots=True)
+class BiasProblem:
+    """A planar graph whose odometry has slow biases.
+
+    Attributes:
+        i, j: nodes of the edges, shape (m,).
+        Z: measured poses of j in i, shape (m, 3): x, y (m), theta (rad).
+        information: Omega, shape (m, 3, 3).
+        jacobian: B of each edge, shape (m, 3, nb); zeros for loops.
+        reference: b0 of each edge, shape (m, nb).
+        prior: mean of b, shape (nb,).
+        prior_information: of it, shape (nb, nb), positive definite.
+    """
+
+    i: NDArray[np.int64]
+    j: NDArray[np.int64]
+    Z: FloatArray
+    information: FloatArray
+    jacobian: FloatArray
+    reference: FloatArray
+    prior: FloatArray
+    prior_information: FloatArray
+
+    def edges(self, bias: FloatArray) -> EdgeArrays:
+        """The edges as they are for a bias, shape (nb,)."""
+        twist = (self.jacobian @ (bias - self.reference)[:, :, None])[:, :, 0]
+        Z = geometry.se2_compose(self.Z, geometry.se2_exp(twist))
+        return EdgeArrays(2, self.i, self.j, geometry.se2_inverse(Z), self.information)
+
+
+@dataclass(frozen=True, slots=True)
+class BiasSolution:
+    """What `solve` found.
+
+    Attributes:
+        poses: shape (n, 3).
+        bias: shape (nb,).
+        squared: e' Omega e per edge at the end, shape (m,).
+        iterations: linear systems solved.
+    """
+
+    poses: FloatArray
+    bias: FloatArray
+    squared: FloatArray
+    iterations: int
+
+
+def solve(
+    problem: BiasProblem,
+    kernels: Kernels,
+    poses: FloatArray,
+    bias: FloatArray,
+    system: SystemPattern,
+    max_iterations: int = 10,
+    tolerance: float = 1e-6,
+) -> BiasSolution:
+    """Poses and bias of least cost near those given.
+
+    Args:
+        problem: edges and prior.
+        kernels: robust kernels of the edges.
+        poses, bias: where to start, shapes (n, 3) and (nb,).
+        system: pattern of the same edges.
+        max_iterations: linear systems solved at most.
+        tolerance: stop when a step promises less than this share of the cost.
+
+    Raises:
+        SingularSystemError: the edges leave a direction free.
+    """
+    costs, cost = _evaluate(problem, kernels, poses, bias)
+    iterations = 0
+    free = system.free_nodes
+    while iterations < max_iterations:
+        iterations += 1
+        pivot = poses[:, :2].mean(axis=0)
+        factors, step_x, step_b, promised, _, _ = _linearised(problem, costs, poses, bias, pivot, system)
+        del factors
+        if promised <= tolerance * cost + 1e-12:
+            break
+        for length in _STEP_LENGTHS:
+            candidate = poses.copy()
+            candidate[free] = residuals.perturbed(2, poses[free], length * step_x, pivot)
+            candidate_bias = bias + length * step_b
+            new_costs, new_cost = _evaluate(problem, kernels, candidate, candidate_bias)
+            if new_cost < cost:
+                break
+        if not new_cost < cost:
+            break
+        gain = cost - new_cost
+        poses, bias, costs, cost = candidate, candidate_bias, new_costs, new_cost
+        if gain <= tolerance * cost:
+            break
+    return BiasSolution(poses, bias, costs.squared, iterations)
+
+
+def joint_covariance(
+    problem: BiasProblem,
+    kernels: Kernels,
+    poses: FloatArray,
+    bias: FloatArray,
+    system: SystemPattern,
+    nodes: list[int],
+) -> FloatArray:
+    """Joint covariance of chosen nodes, shape (3 k, 3 k), each as a twist in its own frame; 0 for fixed nodes.
+
+    The bias's uncertainty is in it.
+    """
+    k = len(nodes)
+    pivot = poses[:, :2].mean(axis=0)
+    costs, _ = _evaluate(problem, kernels, poses, bias)
+    factors, _, _, _, by_bias, S = _linearised(problem, costs, poses, bias, pivot, system)
+    f = system.free_nodes.size
+    place = np.full(poses.shape[0], -1)
+    place[system.free_nodes] = np.arange(f)
+    to_node = residuals.world_to_node(2, poses[nodes], pivot)
+    selected = np.zeros((f, 3, k, 3))
+    for column, node in enumerate(nodes):
+        if place[node] >= 0:
+            selected[place[node], :, column] = to_node[column].T
+    columns = selected.reshape(f * 3, k * 3)
+    covariance = columns.T @ factors.solve(columns)
+    spread = columns.T @ by_bias
+    covariance = covariance + spread @ np.linalg.solve(S, spread.T)
+    return np.asarray(0.5 * (covariance + covariance.T))
+
+
+def _evaluate(
+    problem: BiasProblem, kernels: Kernels, poses: FloatArray, bias: FloatArray
+) -> tuple[EdgeCosts, float]:
+    costs = edge_costs(problem.edges(bias), kernels, poses, "gtsam")
+    off = bias - problem.prior
+    return costs, costs.cost + float(off @ problem.prior_information @ off)
+
+
+def _linearised(
+    problem: BiasProblem,
+    costs: EdgeCosts,
+    poses: FloatArray,
+    bias: FloatArray,
+    pivot: FloatArray,
+    system: SystemPattern,
+) -> tuple[SuperLU, FloatArray, FloatArray, float, FloatArray, FloatArray]:
+    """Factors of H_xx, steps of poses (f, 3) and bias (nb,), promised gain, H_xx^-1 H_xb (3 f, nb), and the bias's
+    information when the poses are eliminated (nb, nb).
+    """
+    edges = problem.edges(bias)
+    gradient, blocks = normal_equations(edges, costs, poses, pivot, system, "gtsam")
+    factors = system.factorise(blocks)
+    J = residuals.error_slopes(2, costs.E, costs.e, "gtsam") @ residuals.world_to_node(2, poses, pivot)[edges.j]
+    J_Omega = np.swapaxes(J, -1, -2) @ (costs.weights[:, None, None] * edges.information)
+    weighted = costs.weights[:, None, None] * edges.information
+    B = -problem.jacobian
+    nb = bias.size
+    cross = J_Omega @ B
+    H_xb = np.stack([system.gradient(cross[:, :, c]).reshape(-1) for c in range(nb)], axis=1)
+    BtW = np.swapaxes(B, -1, -2) @ weighted
+    H_bb = (BtW @ B).sum(axis=0) + problem.prior_information
+    g_b = (BtW @ costs.e[:, :, None])[:, :, 0].sum(axis=0) + problem.prior_information @ (bias - problem.prior)
+    g_x = gradient.reshape(-1)
+    solved = np.asarray(factors.solve(np.column_stack([g_x, H_xb])))
+    y_g, y_b = solved[:, 0], solved[:, 1:]
+    S = H_bb - H_xb.T @ y_b
+    step_b = -np.linalg.solve(S, g_b - H_xb.T @ y_g)
+    step_x = -y_g - y_b @ step_b
+    promised = -float(g_x @ step_x + g_b @ step_b)
+    return factors, step_x.reshape(-1, 3), step_b, promised, y_b, S

@@ -1,0 +1,124 @@
+"""Scan matching as odometry: each few centimetres the whiskers' contacts are fitted onto the ground touched lately.
+
+A row of whiskers comes where the row before it was half a second ago: their heights tell how far the robot has moved
+since. What the ground does not constrain (a flat floor: x, y and heading) the information matrix says, and there
+the dead reckoning rules. Contacts share the errors of their whiskers, so their information counts for a share only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robominer_slam.configuration.robust_slam_section import ScanMatchingSection
+from robominer_slam.geometry import wrap_angle
+from robominer_slam.slam.local_map import LocalMap
+from robominer_slam.slam.surface import SurfaceModel
+from robominer_slam.slam.surface_registration import YAW, Z, fit, placed
+
+FloatArray = NDArray[np.float64]
+
+#: Fewer contacts are not worth a match.
+LEAST_CONTACTS = 8
+#: Turning by 1 rad moves the whiskers by about this, m: travel counts both.
+TURN_ARM = 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class ScanCorrection:
+    """What a match says about the predicted pose.
+
+    Attributes:
+        offset: of (x, y, yaw) in odom, measured less predicted, shape (3,).
+        information: of it, already discounted, shape (3, 3); directions that nothing constrains have none.
+        height: offset of z, m.
+    """
+
+    offset: FloatArray
+    information: FloatArray
+    height: float
+
+
+class ScanOdometry:
+    """Matches the frames of a drive with the local map.
+
+    Attributes:
+        matches: made so far.
+        travelled: way of the array, m.
+    """
+
+    def __init__(self, parameters: ScanMatchingSection, model: SurfaceModel, reach: float) -> None:
+        """Start with an empty map.
+
+        Args:
+            parameters: with units and reasons there.
+            model: how touches make a surface.
+            reach: of the farthest contact from base_link, m.
+        """
+        self._parameters = parameters
+        self._reach = reach
+        self._map = LocalMap(
+            model, parameters.keep, parameters.age, parameters.cell, parameters.per_cell, parameters.rebuild
+        )
+        self._last: FloatArray | None = None
+        self._before: FloatArray | None = None
+        self.matches = 0
+        self.travelled = 0.0
+
+    def match(self, pose: FloatArray, covariance: FloatArray, points: FloatArray) -> ScanCorrection | None:
+        """Match a frame, if the robot has moved far enough since the last.
+
+        Args:
+            pose: predicted x, y, yaw, z in odom, shape (4,).
+            covariance: of it since the reference that the map hangs on, shape (4, 4).
+            points: contacts in base_link, levelled, shape (m, 3), m.
+        """
+        self._travel(pose)
+        if len(points) < LEAST_CONTACTS or not self._due(pose):
+            return None
+        self._map.update(self.travelled, pose[:2], self._reach)
+        if not len(self._map.surface):
+            return None
+        prior = np.linalg.inv(covariance + np.eye(4) * 1e-12)
+        found = fit(self._map.surface, points, pose, prior, associations=self._parameters.associations)
+        if found.overlap * len(points) < LEAST_CONTACTS or found.inliers < self._parameters.least_inliers:
+            return None
+        self.matches += 1
+        offset = found.pose - pose
+        offset[YAW] = wrap_angle(offset[YAW])
+        # With the common height left free: what remains is about x, y and heading.
+        H = found.information * self._parameters.share
+        planar = H[:3, :3] - np.outer(H[:3, Z], H[Z, :3]) / max(H[Z, Z], 1e-12)
+        # The least-squares offset of the touches alone: H d = -g at the predicted pose.
+        gradient = found.gradient * self._parameters.share - H @ offset
+        reduced = gradient[:3] - H[:3, Z] * gradient[Z] / max(H[Z, Z], 1e-12)
+        return ScanCorrection(_least(planar, -reduced), planar, float(offset[Z]))
+
+    def add(self, pose: FloatArray, points: FloatArray) -> None:
+        """Put a frame's contacts (in base_link, levelled) into the map at its corrected pose (x, y, yaw, z)."""
+        if not self._due(pose):
+            return
+        self._last = pose.copy()
+        if len(points):
+            self._map.add(self.travelled, placed(points, pose))
+
+    def _travel(self, pose: FloatArray) -> None:
+        if self._before is not None:
+            step = pose - self._before
+            self.travelled += float(np.hypot(step[0], step[1])) + TURN_ARM * abs(float(wrap_angle(step[YAW])))
+        self._before = pose.copy()
+
+    def _due(self, pose: FloatArray) -> bool:
+        if self._last is None:
+            return True
+        step = pose - self._last
+        moved = float(np.hypot(step[0], step[1])) + TURN_ARM * abs(float(wrap_angle(step[YAW])))
+        return moved >= self._parameters.step
+
+
+def _least(information: FloatArray, right_side: FloatArray) -> FloatArray:
+    """Shortest solution of H d = b: directions without information stay where they are."""
+    solution: FloatArray = np.linalg.lstsq(information, right_side, rcond=1e-9)[0]
+    return solution

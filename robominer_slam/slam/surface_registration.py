@@ -1,0 +1,126 @@
+"""Fits touches onto a touched surface: x, y, yaw and z of one in the other, by their heights.
+
+Each touch has the residual r = z - h(x, y); its slope by the pose comes from the surface's slope. Gauss-Newton with
+a Cauchy weight per touch (side contacts, whiskers on whiskers, edges), and a Gaussian prior where there is one. The
+information matrix H = J' W J tells which directions the ground constrains: on a flat floor only z.
+
+Sources: Zhang, "Parameter estimation techniques" (1997) for the weights; Censi, "An accurate closed-form estimate of
+ICP's covariance" (ICRA 2007) for what H says and what it does not (touches share the errors of their whiskers).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robominer_slam.geometry import wrap_angle
+from robominer_slam.slam.surface import Surface, SurfacePatches
+
+FloatArray = NDArray[np.float64]
+
+#: Order of the four unknowns.
+X, Y, YAW, Z = range(4)
+#: Reweightings for one set of planes: each costs a few small matrix products.
+REWEIGHTINGS = 3
+#: Width of the Cauchy kernel, in sigmas.
+KERNEL_WIDTH = 2.5
+#: Residuals under this many sigmas count as fitting.
+INLIER_SIGMAS = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceMatch:
+    """Where touches fit onto a surface.
+
+    Attributes:
+        pose: x, y (m), yaw (rad), z (m) of the touches' frame in the surface's, shape (4,).
+        information: H at the pose, prior left out, shape (4, 4).
+        gradient: J' W r at the pose, prior left out, shape (4,): where the touches alone would pull.
+        overlap: share of the touches that lie where the surface is known.
+        inliers: share of those whose residual is within three sigmas.
+        rms: of the inliers' residuals, m.
+        relief: standard deviation of the surface's heights under the touches, its common tilt left out, m.
+    """
+
+    pose: FloatArray
+    information: FloatArray
+    gradient: FloatArray
+    overlap: float
+    inliers: float
+    rms: float
+    relief: float
+
+
+def placed(points: FloatArray, pose: FloatArray) -> FloatArray:
+    """Points (m, 3) of a frame at `pose` (x, y, yaw, z) in the other frame, m."""
+    c, s = np.cos(pose[YAW]), np.sin(pose[YAW])
+    x, y = points[:, 0], points[:, 1]
+    return np.column_stack([c * x - s * y + pose[X], s * x + c * y + pose[Y], points[:, 2] + pose[Z]])
+
+
+def residual_jacobian(q: FloatArray, pose: FloatArray, slope: FloatArray) -> FloatArray:
+    """Derivative (m, 4) of z - h(x, y) by (x, y, yaw, z), for touches at q (m, 3) on a surface of `slope` (m, 2)."""
+    J = np.empty((len(q), 4))
+    J[:, :2] = -slope
+    J[:, YAW] = slope[:, 0] * (q[:, 1] - pose[Y]) - slope[:, 1] * (q[:, 0] - pose[X])
+    J[:, Z] = 1.0
+    return J
+
+
+def fit(
+    surface: Surface,
+    points: FloatArray,
+    guess: FloatArray,
+    prior_information: FloatArray,
+    associations: int = 2,
+) -> SurfaceMatch:
+    """Fit touches onto a surface.
+
+    Args:
+        surface: what was touched before.
+        points: touches in their own frame, level, shape (m, 3), m.
+        guess: first pose and mean of the prior, shape (4,).
+        prior_information: of the prior, shape (4, 4); zeros for none, but then the touches must constrain the pose
+            or the step is only as long as they say.
+        associations: how often planes are looked up; once suffices where the guess is good to millimetres.
+    """
+    pose = guess.copy()
+    H, gradient = np.zeros((4, 4)), np.zeros(4)
+    regular = prior_information + np.eye(4) * 1e-9
+    for _ in range(associations):
+        q = placed(points, pose)
+        patches = surface.at(q[:, :2])
+        known = patches.known
+        if int(known.sum()) < 4:
+            return SurfaceMatch(pose, np.zeros((4, 4)), np.zeros(4), float(known.mean()), 0.0, 0.0, 0.0)
+        r = q[known, 2] - patches.height[known]
+        J = residual_jacobian(q[known], pose, patches.slope[known])
+        inverse_variance = 1.0 / patches.variance[known]
+        offset = pose - guess
+        offset[YAW] = wrap_angle(offset[YAW])
+        step = np.zeros(4)
+        for _ in range(REWEIGHTINGS):
+            e = r + J @ step
+            weight = inverse_variance / (1.0 + e * e * inverse_variance / KERNEL_WIDTH**2)
+            JtW = J.T * weight
+            H = JtW @ J
+            step = np.linalg.solve(H + regular, -JtW @ r - prior_information @ offset)
+        gradient = JtW @ (r + J @ step)
+        pose = pose + step
+    return _judged(pose, H, gradient, patches, q, r + J @ step)
+
+
+def _judged(
+    pose: FloatArray, H: FloatArray, gradient: FloatArray, patches: SurfacePatches, q: FloatArray, residual: FloatArray
+) -> SurfaceMatch:
+    known = patches.known
+    fits = np.abs(residual) < INLIER_SIGMAS * np.sqrt(patches.variance[known])
+    rms = float(np.sqrt(np.mean(residual[fits] ** 2))) if fits.any() else 0.0
+    heights = patches.height[known]
+    xy = q[known, :2] - q[known, :2].mean(axis=0)
+    plane = np.column_stack([np.ones(len(xy)), xy])
+    tilt, *_ = np.linalg.lstsq(plane, heights, rcond=None)
+    relief = float(np.std(heights - plane @ tilt))
+    return SurfaceMatch(pose, H, gradient, float(known.mean()), float(fits.mean()), rms, relief)
