@@ -22,6 +22,8 @@ FloatArray = NDArray[np.float64]
 #: Touches that make up the surface at one place, at most and at least.
 NEIGHBOURS = 10
 LEAST_NEIGHBOURS = 4
+#: A few touches may lie in a plane by chance: their misfit, in variances, counts as no less.
+LEAST_MISFIT = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +110,6 @@ class Surface:
         # The estimate is C X'W z: errors of z with covariance W^-1 reach it as C X'WX C = C - C prior C.
         by_slope = covariance[:, 1:, 1:]
         slope_noise = by_slope - (by_slope @ by_slope) / model.slope_sigma**2
-        slope_noise *= np.maximum(misfit, 1.0)[:, None, None]
+        slope_noise *= np.clip(misfit, LEAST_MISFIT, None)[:, None, None]
         height = np.where(known, datum + fitted[:, 0], 0.0)
         return SurfacePatches(known, height, fitted[:, 1:], variance, slope_noise)
