@@ -19,7 +19,10 @@ class RobustEstimationSection(Section):
         0.1, "rad/m", "as drag_common_deg, of the turn that the array's directions show", low=0.0, high=10.0
     )
     drag_turn_share: float = parameter(
-        0.1, "1", "of a turn, the directions may miss: joints that are stiffer across than along", low=0.0, high=1.0
+        0.15, "1", "of a turn, the directions may miss: joints that are stiffer across than along", low=0.0, high=1.0
+    )
+    drag_turn_length: float = parameter(
+        5.0, "m", "way over which that stays the same: a loop around one slope", low=0.0, high=100.0
     )
     drag_length: float = parameter(
         0.1, "m", "way over which the array's deviation stays the same (1/e)", low=0.005, high=1.0

@@ -17,9 +17,10 @@ What is left is no white noise: tips keep their errors for some centimetres (so 
 turns, because a rod's joint may be stiffer across than along. Measured on simulated drives; the numbers are in the
 configuration section `robust_estimation`.
 
-The measurement is an angle, so it says nothing of the speed. It is linearised at the velocity that it leads to itself
-(an iterated filter with two steps): at a noisy prediction, or with the measured n, noise would pass for knowledge of
-the speed, and the speed would creep.
+The measurement is an angle, so it says nothing of the speed. It must be linearised at a direction of motion that shares
+no noise with it: at the prediction, at what the measurement leads to, or with the measured n, the products of noise
+with itself pump the speed up or down, measurement by measurement. So it is linearised at the direction that the
+measurements before it showed, averaged over the way.
 """
 
 from __future__ import annotations
@@ -52,6 +53,12 @@ STEEPEST = 0.4
 DOUBTFUL_SLOPE = 0.15
 #: Lever of the array, m, by which turning spreads the directions of its tips.
 ARM = 0.25
+#: Makes vx, vy, wz alike: m/s each.
+METRIC = np.array([1.0, 1.0, ARM])
+#: A prediction farther (cosine) from the direction that was shown before means a new way.
+SAME_DIRECTION = 0.9
+#: Way over which the shown direction is averaged, m.
+SHOWN_LENGTH = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +102,8 @@ class DragDirection:
         self._frames: deque[tuple[int, Contacts]] = deque(maxlen=WINDOW + 1)
         self._way = 0.0
         self._last_ns: int | None = None
+        self._direction: FloatArray | None = None
+        self._shown_way = 0.0
         self._slide_information = settings.drag_sigma_slide**-2
         #: Estimated angle by which a cross slope turns a rod, rad per slope.
         self.slide = settings.drag_slide
@@ -139,8 +148,24 @@ class DragDirection:
         tips = self._trailing(contacts, frames[0][1], span, velocity)
         if tips is None:
             return None
+        scaled = velocity * METRIC
+        size = math.sqrt(scaled @ scaled)
+        direction = self._direction
+        if direction is None or direction @ scaled < SAME_DIRECTION * size:
+            direction, self._shown_way = scaled / size, 0.0
+        new_way = self._shown_way < settings.drag_length
+        found = self._information(tips, velocity, direction / METRIC * size)
+        shown = self._shown(found, velocity, covariance)
+        self._shown_way += way
+        direction = direction + way / min(self._shown_way, SHOWN_LENGTH) * (shown - direction)
+        self._direction = direction / math.sqrt(direction @ direction)
+        if new_way:
+            return None
+        self._learn_slide(found, covariance, min(1.0, way / (2.0 * settings.drag_length)))
         discount = min(1.0, way / (2.0 * settings.drag_length))
-        return self._information(tips, velocity, covariance, discount)
+        shared = np.linalg.inv(np.eye(3) + found.information @ self._common(velocity)) * discount
+        information = shared @ found.information
+        return DragInformation(0.5 * (information + information.T), shared @ found.vector, found.tips)
 
     def _trailing(self, contacts: Contacts, old: Contacts, span: float, velocity: FloatArray) -> _Tips | None:
         index = contacts.index
@@ -163,25 +188,29 @@ class DragDirection:
         gradient = self._slopes.gradient(contacts.points, index)
         return _Tips(p[:, ok], turning[:, ok], d[:, ok], gradient[:, ok], swept[:, ok])
 
-    def _information(
-        self, tips: _Tips, velocity: FloatArray, covariance: FloatArray, discount: float
-    ) -> DragInformation:
-        swept = tips.swept
-        for step in range(2):
-            rows, angle, cross, speed, weight = self._linearised(tips, swept)
-            steady = tips.swept - tips.turning
-            innovation = angle * speed - (rows[0] * steady[0] + rows[1] * steady[1])
-            weighted = rows * weight
-            information, vector = weighted @ rows.T, weighted @ innovation
-            if step == 0:
-                grown = covariance @ (discount * information)
-                first = np.linalg.solve(np.eye(3) + grown, covariance @ (discount * vector))
-                swept = _swept(tips.p, tips.turning, velocity + first)
-        self._learn_slide(weighted, rows, innovation, cross * speed, weight, covariance, discount)
-        common = self._common(velocity)
-        shared = np.linalg.inv(np.eye(3) + information @ common)
-        information = discount * (shared @ information)
-        return DragInformation(0.5 * (information + information.T), discount * (shared @ vector), len(angle))
+    def _information(self, tips: _Tips, velocity: FloatArray, at: FloatArray) -> _Frame:
+        """What the tips say about the velocity's difference from `velocity`, linearised at `at`."""
+        rows, angle, cross, speed, weight = self._linearised(tips, _swept(tips.p, tips.turning, at))
+        steady = tips.swept - tips.turning
+        innovation = angle * speed - (rows[0] * steady[0] + rows[1] * steady[1])
+        weighted = rows * weight
+        sliding = cross * speed
+        return _Frame(
+            weighted @ rows.T,
+            weighted @ innovation,
+            len(angle),
+            weighted @ sliding,
+            float(sliding @ (weight * sliding)),
+            float(sliding @ (weight * innovation)),
+        )
+
+    @staticmethod
+    def _shown(found: _Frame, velocity: FloatArray, covariance: FloatArray) -> FloatArray:
+        """Direction of the motion as this frame shows it: scaled (vx, vy, wz) of length one."""
+        correction = np.linalg.solve(np.eye(3) + covariance @ found.information, covariance @ found.vector)
+        scaled = (velocity + correction) * METRIC
+        direction: FloatArray = scaled / max(math.sqrt(scaled @ scaled), 1e-9)
+        return direction
 
     def _linearised(
         self, tips: _Tips, swept: FloatArray
@@ -206,7 +235,9 @@ class DragDirection:
         """Covariance of the velocity that the array says, of what its tips have in common, shape (3, 3)."""
         settings = self._settings
         speed = math.hypot(velocity[0], velocity[1])
-        turn = settings.drag_turn_share * abs(velocity[2])
+        # What turning adds lasts longer than the rest: it counts as if it did not average out for so long.
+        lasting = math.sqrt(max(settings.drag_turn_length / settings.drag_length, 1.0))
+        turn = settings.drag_turn_share * abs(velocity[2]) * lasting
         side = (math.radians(settings.drag_common_deg) * speed) ** 2 + (turn * ARM) ** 2
         common = np.zeros((3, 3))
         if speed > 1e-9:
@@ -217,31 +248,20 @@ class DragDirection:
         common[2, 2] = turn**2 + (settings.drag_common_curvature * speed) ** 2
         return common
 
-    def _learn_slide(
-        self,
-        weighted: FloatArray,
-        rows: FloatArray,
-        innovation: FloatArray,
-        sliding: FloatArray,
-        weight: FloatArray,
-        covariance: FloatArray,
-        discount: float,
-    ) -> None:
+    def _learn_slide(self, found: _Frame, covariance: FloatArray, discount: float) -> None:
         """Estimate `slide` from how the tips of this frame differ; what they have in common is the velocity's."""
-        shared = weighted @ sliding
-        prior = np.linalg.inv(covariance + 1e-12 * np.eye(3))
-        to_velocity = np.linalg.solve(weighted @ rows.T + prior, np.column_stack([shared, weighted @ innovation]))
-        information = discount * (sliding @ (weight * sliding) - shared @ to_velocity[:, 0])
-        vector = discount * (sliding @ (weight * innovation) - shared @ to_velocity[:, 1])
+        both = np.column_stack([found.sliding_rows, found.vector])
+        to_velocity = np.linalg.solve(np.eye(3) + covariance @ found.information, covariance @ both)
+        shared = found.sliding_rows @ to_velocity
+        information = discount * max(found.sliding_sliding - float(shared[0]), 0.0)
+        vector = discount * (found.sliding_innovation - float(shared[1]))
         settings = self._settings
         # The ground changes: what was learned fades towards the prior.
-        prior_information = settings.drag_sigma_slide**-2
+        prior = settings.drag_sigma_slide**-2
         kept = math.exp(-settings.drag_spacing / settings.drag_slide_length)
-        old = self._slide_information
-        slide = settings.drag_slide + kept * (self.slide - settings.drag_slide)
-        old = prior_information + kept * (old - prior_information)
-        self._slide_information = old + max(information, 0.0)
-        self.slide = slide + vector / self._slide_information
+        self._slide_information = prior + kept * (self._slide_information - prior) + information
+        faded = settings.drag_slide + kept * (self.slide - settings.drag_slide)
+        self.slide = faded + vector / self._slide_information
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,6 +276,22 @@ class _Tips:
     d: FloatArray
     gradient: FloatArray
     swept: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    """A frame's information before what its tips have in common is allowed for.
+
+    information (3, 3), vector (3,) and tips as of `DragInformation`; sliding_*: weighted products of each tip's
+    derivative by `slide` with the rows (3,), with itself and with the innovations.
+    """
+
+    information: FloatArray
+    vector: FloatArray
+    tips: int
+    sliding_rows: FloatArray
+    sliding_sliding: float
+    sliding_innovation: float
 
 
 def _swept(p: FloatArray, turning: FloatArray, velocity: FloatArray) -> FloatArray:

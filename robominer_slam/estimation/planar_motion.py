@@ -177,23 +177,33 @@ class PlanarFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has 
         self.F, self.Q = F, Q
         self.predict()
 
-    def correct(self, innovation: FloatArray, H: FloatArray, R: FloatArray) -> float:
+    def correct(self, innovation: FloatArray, H: FloatArray, R: FloatArray, held: FloatArray | None = None) -> float:
         """Update with a measurement that differs from its prediction by `innovation`, shape (m,).
 
         Args:
             innovation: measured less predicted.
             H: derivative of the prediction by the state, shape (m, n).
             R: covariance of the measurement, shape (m, m).
+            held: orthonormal rows, shape (k, n): combinations of states that this measurement must not move.
 
         Returns:
             The squared Mahalanobis distance.
         """
-        S = H @ self.P @ H.T + R
+        PHT = self.P @ H.T
+        S = H @ PHT + R
         distance = float(innovation @ np.linalg.solve(S, innovation))
         if distance > self.gate:
             self.outliers += 1
             R = R * (distance / self.gate)
-        self.update(innovation, lambda _: H, lambda _: np.zeros(len(innovation)), R)
+        if held is None:
+            self.update(innovation, lambda _: H, lambda _: np.zeros(len(innovation)), R)
+            return distance
+        # Any gain is allowed as long as the covariance follows it (Joseph's form); this one leaves `held` alone.
+        gain = np.linalg.solve(H @ PHT + R, PHT.T).T
+        gain -= held.T @ (held @ gain)
+        left = np.eye(len(self.x)) - gain @ H
+        self.x = self.x + gain @ innovation
+        self.P = left @ self.P @ left.T + gain @ R @ gain.T
         return distance
 
     def keyframe(self) -> None:

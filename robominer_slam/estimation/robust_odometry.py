@@ -163,7 +163,31 @@ class RobustOdometry:
         rows, innovation = found.compressed()
         H = np.zeros((len(rows), len(self._filter.x)))
         H[:, VELOCITY] = rows
-        self._filter.correct(innovation, H, np.eye(len(rows)))
+        ekf.correct(innovation, H, np.eye(len(rows)), self._along_motion())
+
+    def _along_motion(self) -> FloatArray:
+        """Combinations of states that are motion ahead, shape (k, n): the drag's angle must not move them.
+
+        Its derivative by them is zero but for noise in the direction, which repeated updates would take for
+        knowledge of the speed.
+        """
+        x = self._filter.x
+        vx, vy = x[VX], x[VY]
+        size = max(math.hypot(vx, vy), 1e-9)
+        ahead = np.array([vx, vy]) / size
+        c, s = math.cos(x[YAW]), math.sin(x[YAW])
+        if self._source == "odometry":
+            held = np.zeros((3, len(x)))
+            held[2, SLOW : SLOW + 2] = ahead
+        else:
+            held = np.zeros((4, len(x)))
+            by_slip = ahead * self._input
+            by_slip = by_slip / max(math.hypot(by_slip[0], by_slip[1]), 1e-9)
+            held[2, SLIP_MEAN.start : SLIP_MEAN.start + 2] = by_slip
+            held[3, SLIP.start : SLIP.start + 2] = by_slip
+        held[0, VX:WZ] = ahead
+        held[1, X:YAW] = c * ahead[0] - s * ahead[1], s * ahead[0] + c * ahead[1]
+        return held
 
     def measures_motion(self, measurement: Measurement) -> bool:
         """Screws do if all four are heard of, or the ready-made odometry; a gyro alone does not."""
