@@ -82,6 +82,12 @@ class RobustEstimationSection(Section):
         0.05, "rad/s", "all screws slower than this: the robot stands, velocity zero", low=0.0, high=10.0
     )
     sigma_still: float = parameter(0.002, "m/s, rad/s", "creep of a robot whose screws stand", low=1e-5, high=0.1)
+    sigma_match: float = parameter(
+        0.0005, "m", "what scan matches have in common: a row's whiskers err by 1.2 mm each against the next row's",
+        low=0.0, high=0.1,
+    )  # fmt: skip
+    sigma_match_yaw_deg: float = parameter(0.12, "deg", "as sigma_match, over the array's half width", low=0.0, high=5.0)
+    match_length: float = parameter(3.0, "m", "way over which that stays the same", low=0.01, high=100.0)
     gate: float = parameter(
         16.0, "1", "squared Mahalanobis distance (three axes) beyond which a measurement loses weight: 0.1 % by chance",
         low=3.0, high=1000.0,

@@ -101,9 +101,13 @@ class RobustOdometry:
         self._drag = drag
         self._screw_matrix = screw_matrix
         fused = source == "fused"
-        n = SLOW + (7 if fused else 3)
+        n = SLOW + (7 if fused else 3) + 3
+        self._match = slice(n - 3, n)
         variance = np.zeros(n)
         variance[VELOCITY] = SIGMA_START**2
+        variance[self._match] = self._match_variance = np.square(
+            [settings.sigma_match, settings.sigma_match, np.deg2rad(settings.sigma_match_yaw_deg)]
+        )
         x = np.zeros(n)
         if fused:
             variance[GYRO_BIAS] = settings.sigma_gyro_bias**2
@@ -259,6 +263,7 @@ class RobustOdometry:
         rows = vectors[:, told].T
         H = np.zeros((len(rows), len(x)))
         H[:, REL] = rows
+        H[:, self._match] = rows
         self._filter.correct(rows @ (to_key @ offset), H, np.diag(1.0 / values[told]))
 
     def relative_covariance(self) -> FloatArray:
@@ -366,6 +371,7 @@ class RobustOdometry:
         q = np.zeros(len(x))
         way = math.hypot(x[VX], x[VY]) * dt
         q[X] = q[Y] = settings.position_walk**2 * way
+        q[self._match] = self._match_variance * (2.0 * way / settings.match_length)
         walk = settings.acceleration_walk**2 * dt
         Q_velocity = np.diag([walk, walk, settings.angular_acceleration_walk**2 * dt])
         gyro = screws = None
