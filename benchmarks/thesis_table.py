@@ -21,7 +21,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from drivers.recording_reader import Recording
-from robominer_slam.cli.evaluation_output import print_campaign, run_with_progress
+from robominer_slam.cli.evaluation_output import print_campaign, run_with_progress, write_report
 from robominer_slam.cli.number_list import number_list
 from robominer_slam.configuration.file import ConfigurationError
 from robominer_slam.configuration.overrides import parse_override, parse_variant
@@ -137,6 +137,8 @@ def main() -> None:
     except (ConfigurationError, ResultsError, worlds.WorldError) as error:
         sys.exit(f"error: {error}")
     campaign = run_with_progress(tasks, arguments.out, arguments.jobs, surface_of)
+    if arguments.report is not None and campaign.records:
+        write_report(arguments.report, campaign.records, campaign.files)
     print_campaign(campaign, arguments.out, arguments.as_json)
     sys.exit(1 if campaign.failures else 0)
 

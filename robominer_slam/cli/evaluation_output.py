@@ -14,7 +14,7 @@ from rich.table import Table
 from robominer_slam.evaluation.acceptance import acceptance_table, text_tables
 from robominer_slam.evaluation.campaign import Campaign, run_tasks
 from robominer_slam.evaluation.results_file import RESULTS, results, write_results
-from robominer_slam.evaluation.run_record import RunRecord
+from robominer_slam.evaluation.run_record import ResultsError, RunRecord
 from robominer_slam.evaluation.run_task import RunTask, SurfaceOf
 
 
@@ -33,6 +33,23 @@ def run_with_progress(
         campaign = run_tasks(tasks, folder, jobs, surface_of, on_done)
     write_results(campaign, folder)
     return campaign
+
+
+def write_report(path: Path, records: Sequence[RunRecord], files: Sequence[Path]) -> None:
+    """Write the HTML page, with a progress bar on stderr.
+
+    Raises:
+        ResultsError: a saved run is missing or damaged, or matplotlib is not installed.
+    """
+    try:
+        from robominer_slam.evaluation.page.page import write_page  # matplotlib is in the extras only
+    except ModuleNotFoundError as error:
+        raise ResultsError(f"the page needs {error.name}: pip install robominer-slam[operator]") from error
+    path.parent.mkdir(parents=True, exist_ok=True)
+    drives = len({record.key.drive for record in records})
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        bar = progress.add_task("drawing", total=drives)
+        write_page(path, records, files, lambda drive: progress.update(bar, advance=1, description=drive))
 
 
 def print_campaign(campaign: Campaign, folder: Path, as_json: bool, echo: Callable[[str], None] = click.echo) -> None:

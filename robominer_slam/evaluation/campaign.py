@@ -19,8 +19,9 @@ from robominer_slam.evaluation.run_result import saved_record
 from robominer_slam.evaluation.run_task import RunTask, SurfaceOf, evaluate_run
 
 RUNS = "runs"
-#: Packages that decide what a replay gives.
+#: Packages that decide what a replay gives, and what in them does not.
 CODE = ("calibration", "drivers", "robominer_slam")
+PRESENTATION = {"cli", "page", "publishing"}
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,7 @@ def plan(
     sources: Sequence[str],
     variants: Sequence[Variant] = (),
     common: Sequence[Override] = (),
+    odometry_seeds: Sequence[int] | None = None,
 ) -> list[RunTask]:
     """Every recording with every source, method and variant; what cannot differ is replayed once.
 
@@ -66,6 +68,7 @@ def plan(
         sources: of odometry, as `estimation.source` has them.
         variants: to be run beside the configuration as it is, with the methods that they concern.
         common: overrides of every run.
+        odometry_seeds: recordings of other odometry noises are left out; None takes all.
 
     Raises:
         RecordingError: one cannot be read.
@@ -81,6 +84,8 @@ def plan(
     for path in recordings:
         metadata = Recording(path).metadata
         name = DriveName.of(path.stem, metadata)
+        if odometry_seeds is not None and name.odometry_seed not in odometry_seeds:
+            continue
         for source in sources:
             seed = name.odometry_seed if source == "odometry" else None
             for method in methods:
@@ -104,7 +109,7 @@ def code_digest() -> str:
     digest = hashlib.sha256()
     for package in CODE:
         for path in sorted((root / package).rglob("*.py")):
-            if "cli" not in path.relative_to(root).parts:
+            if not PRESENTATION & set(path.relative_to(root).parts):
                 digest.update(path.read_bytes())
     return digest.hexdigest()
 

@@ -31,6 +31,8 @@ class RunResult:
         graph: the pose graph at the end, as `map/graph` has it.
         wrong: which of the graph's loop closures are wrong, in their order, shape (n,).
         grid: heights of the final map.
+        surface: the true surface's heights at the centres of the grid's cells, of the grid's shape, m; None where
+            nobody knows it.
     """
 
     record: RunRecord
@@ -40,6 +42,7 @@ class RunResult:
     graph: Mapping[str, Any]
     wrong: NDArray[np.bool_]
     grid: HeightGrid
+    surface: FloatArray | None = None
 
     @property
     def slam_errors(self) -> TrajectoryErrors:
@@ -67,6 +70,7 @@ class RunResult:
             height=self.grid.height,
             origin=np.array(self.grid.origin),
             cell=np.array(self.grid.cell),
+            surface=np.zeros(0) if self.surface is None else self.surface,
         )
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_suffix(".part")
@@ -92,6 +96,7 @@ def load_result(path: Path) -> RunResult:
                 graph=json.loads(str(file["graph"])),
                 wrong=file["wrong"],
                 grid=HeightGrid((x, y), float(file["cell"]), file["height"]),
+                surface=file["surface"] if file["surface"].size else None,
             )
     except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error

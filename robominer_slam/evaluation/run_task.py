@@ -18,22 +18,20 @@ from robominer_slam.configuration.overrides import Override, overridden
 from robominer_slam.evaluation.consistency import consistency
 from robominer_slam.evaluation.height_errors import HeightFunction, height_errors
 from robominer_slam.evaluation.metrics import ErrorStatistics, TrajectoryErrors, trajectory_errors
-from robominer_slam.evaluation.pose_graph_errors import ClosureErrors, closure_errors
+from robominer_slam.evaluation.pose_graph_errors import LEAST_WEIGHT, ClosureErrors, closure_errors
 from robominer_slam.evaluation.run_record import ClosureCounts, RunKey, RunRecord
 from robominer_slam.evaluation.run_result import RunResult
 from robominer_slam.evaluation.trajectory import Trajectory, TrajectoryError, interpolate
 from robominer_slam.evaluation.trajectory_files import truth_of
 from robominer_slam.frame_result import FrameResult
 from robominer_slam.graph_json import graph_json
-from robominer_slam.mapping.height_grid import height_grid
+from robominer_slam.mapping.height_grid import HeightGrid, height_grid
 from robominer_slam.replay import ReplayInputs, ReplayResult, prepare, replay
 
 FloatArray = NDArray[np.float64]
 #: From a recording's metadata to the true surface, where somebody knows it.
 SurfaceOf = Callable[[Mapping[str, str]], HeightFunction | None]
 
-#: A closure that the robust kernel leaves less than this has no say.
-LEAST_WEIGHT = 0.1
 #: Cells of the map that is kept for the figures, m.
 FIGURE_CELL_M = 0.02
 
@@ -141,7 +139,8 @@ def evaluate_run(task: RunTask, surface_of: SurfaceOf | None = None) -> RunResul
         keyframe_s=_statistics(time_s[with_keyframe]),
     )
     grid = height_grid(cloud, FIGURE_CELL_M)
-    return RunResult(record, own_truth, odometry, slam, graph, closures.wrong, grid)
+    true_heights = surface(*_centres(grid)) if surface is not None and len(cloud) else None
+    return RunResult(record, own_truth, odometry, slam, graph, closures.wrong, grid, true_heights)
 
 
 def _replay(inputs: ReplayInputs) -> tuple[_Frames, ReplayResult, float]:
@@ -156,6 +155,15 @@ def _replay(inputs: ReplayInputs) -> tuple[_Frames, ReplayResult, float]:
 
     result = replay(inputs, on_frame)
     return frames, result, time.perf_counter() - start
+
+
+def _centres(grid: HeightGrid) -> tuple[FloatArray, FloatArray]:
+    """X and y of the cells' centres, of the grid's shape, m."""
+    ny, nx = grid.height.shape
+    x = grid.origin[0] + (np.arange(nx) + 0.5) * grid.cell
+    y = grid.origin[1] + (np.arange(ny) + 0.5) * grid.cell
+    px, py = np.meshgrid(x, y)
+    return px, py
 
 
 def _heading(errors: TrajectoryErrors) -> ErrorStatistics:
