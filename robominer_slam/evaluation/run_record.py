@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from robominer_slam.evaluation.consistency import Consistency
@@ -100,6 +100,8 @@ class RunRecord:
         replay_s: time that the replay took, reading included.
         slam_position_m, slam_heading_deg: of the poses as published.
         odometry_position_m, odometry_heading_deg: of the same run's dead reckoning.
+        slam_distance_m, slam_rotation_deg: of the poses as published, in all three dimensions.
+        slam_relative_m, odometry_relative_m: drift within 25 frames, a second; None for shorter drives.
         keyframes: number of them.
         closures: loop closures.
         height: the map against the true surface; None where that is not known or there is no map.
@@ -119,6 +121,10 @@ class RunRecord:
     slam_heading_deg: ErrorStatistics
     odometry_position_m: ErrorStatistics
     odometry_heading_deg: ErrorStatistics
+    slam_distance_m: ErrorStatistics
+    slam_rotation_deg: ErrorStatistics
+    slam_relative_m: ErrorStatistics | None
+    odometry_relative_m: ErrorStatistics | None
     keyframes: int
     closures: ClosureCounts
     height: HeightErrors | None
@@ -145,15 +151,12 @@ class RunRecord:
         """
         kinds: dict[str, Any] = {
             "key": RunKey,
-            "slam_position_m": ErrorStatistics,
-            "slam_heading_deg": ErrorStatistics,
-            "odometry_position_m": ErrorStatistics,
-            "odometry_heading_deg": ErrorStatistics,
             "closures": ClosureCounts,
             "height": HeightErrors,
             "consistency": Consistency,
-            "frame_s": ErrorStatistics,
-            "keyframe_s": ErrorStatistics,
+            **dict.fromkeys(
+                (field.name for field in fields(cls) if "ErrorStatistics" in str(field.type)), ErrorStatistics
+            ),
         }
         try:
             values = {

@@ -17,7 +17,7 @@ from robominer_slam.configuration.model import Configuration
 from robominer_slam.configuration.overrides import Override, overridden
 from robominer_slam.evaluation.consistency import consistency
 from robominer_slam.evaluation.height_errors import HeightFunction, height_errors
-from robominer_slam.evaluation.metrics import ErrorStatistics, TrajectoryErrors, trajectory_errors
+from robominer_slam.evaluation.metrics import ErrorStatistics, TrajectoryErrors, relative_errors, trajectory_errors
 from robominer_slam.evaluation.pose_graph_errors import LEAST_WEIGHT, ClosureErrors, closure_errors
 from robominer_slam.evaluation.run_record import ClosureCounts, RunKey, RunRecord
 from robominer_slam.evaluation.run_result import RunResult
@@ -34,6 +34,8 @@ SurfaceOf = Callable[[Mapping[str, str]], HeightFunction | None]
 
 #: Cells of the map that is kept for the figures, m.
 FIGURE_CELL_M = 0.02
+#: Frames over which drift is measured: a second of whisker frames.
+RELATIVE_FRAMES = 25
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +132,10 @@ def evaluate_run(task: RunTask, surface_of: SurfaceOf | None = None) -> RunResul
         slam_heading_deg=_heading(slam_errors),
         odometry_position_m=ErrorStatistics.of(odometry_errors.position),
         odometry_heading_deg=_heading(odometry_errors),
+        slam_distance_m=ErrorStatistics.of(slam_errors.distance),
+        slam_rotation_deg=ErrorStatistics.of(np.rad2deg(slam_errors.rotation)),
+        slam_relative_m=_statistics(relative_errors(slam, own_truth, RELATIVE_FRAMES)[0]),
+        odometry_relative_m=_statistics(relative_errors(odometry, own_truth, RELATIVE_FRAMES)[0]),
         keyframes=len(graph["keyframes"]),
         closures=_counts(closures),
         height=height_errors(cloud, surface) if surface is not None else None,

@@ -72,7 +72,7 @@ def page(records: Sequence[RunRecord], files: Sequence[Path], on_done: Callable[
         own = [one for one in views if one.source == source]
         figure = boxplots.errors_by_drive(own, [s for s in series if any(s in one.series for one in own)], look)
         caption = f"As the thesis's figure 16. {boxplots.HOW_TO_READ}; all runs of a drive together."
-        parts.append(picture(figure, f"Odometry: {_source(source)}", caption, "svg", wide=True))
+        parts.append(picture(figure, f"Odometry: {_source(source)}", caption, "svg"))
     parts.append("</div>")
     for drive in drives:
         own = [one for one in views if one.drive == drive]
@@ -144,7 +144,7 @@ def _repeats(one: DriveViews, look: Mapping[str, Style]) -> str:
     """All odometry noises of a drive."""
     name = f"{_heading(one.drive)}, {len(one.seeds)} runs that differ in the odometry's noise"
     caption = f"As the thesis's figure 29. {boxplots.HOW_TO_READ}."
-    parts = [picture(boxplots.errors_by_run(one, look), name, caption, "svg", wide=True)]
+    parts = [picture(boxplots.errors_by_run(one, look), name, caption, "svg")]
     shown: list[tuple[str, Sequence[RunView]]] = [(ODOMETRY_NAME, one.odometry())]
     shown += [(series, one.of_series(series)) for series in one.series]
     everything = [run.odometry if series == ODOMETRY_NAME else run.slam for series, runs in shown for run in runs]

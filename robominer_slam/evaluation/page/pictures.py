@@ -14,8 +14,9 @@ WIDTH_IN = 5.6
 DPI = 150
 
 
-def picture(figure: Figure, title: str, caption: str, kind: Literal["png", "svg"] = "png", wide: bool = False) -> str:
+def picture(figure: Figure, title: str, caption: str, kind: Literal["png", "svg"] = "png") -> str:
     """A `<figure>` with its image inside; `title` describes it for those who cannot see it, too."""
+    wide = figure.get_figwidth() > WIDTH_IN
     buffer = io.BytesIO()
     # Without date and version the same runs give the same page.
     metadata = {"Date": None, "Creator": None} if kind == "svg" else {"Software": None}
