@@ -20,7 +20,7 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
-from drivers.recording_reader import Recording
+from drivers.recording_reader import Recording, RecordingError
 from robominer_slam.cli.evaluation_output import print_campaign, run_with_progress, write_report
 from robominer_slam.cli.number_list import number_list
 from robominer_slam.configuration.file import ConfigurationError
@@ -134,8 +134,9 @@ def main() -> None:
     try:
         recordings = recordings_of(arguments)
         tasks = plan(recordings, arguments.methods, arguments.sources, arguments.variant, arguments.common)
-    except (ConfigurationError, ResultsError, worlds.WorldError) as error:
-        sys.exit(f"error: {error}")
+    except (ConfigurationError, RecordingError, ResultsError, worlds.WorldError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
     campaign = run_with_progress(tasks, arguments.out, arguments.jobs, surface_of)
     if arguments.report is not None and campaign.records:
         write_report(arguments.report, campaign.records, campaign.files)

@@ -218,6 +218,14 @@ def test_the_page_fits_phone_and_dark_mode(parsed):
     assert "color-scheme: light dark" in text
 
 
+def test_a_page_of_odometry_alone(evaluated):
+    _, campaign = evaluated
+    alone = [(r, f) for r, f in zip(campaign.records, campaign.files, strict=True) if r.key.method == "none"]
+    parser = _Page()
+    parser.feed(page([r for r, _ in alone], [f for _, f in alone]))
+    assert len(parser.images) == 2 + 2 + 2
+
+
 def test_table_page_and_json_say_the_same(evaluated, parsed):
     folder, campaign = evaluated
     saved = json.loads((folder / "results.json").read_text())

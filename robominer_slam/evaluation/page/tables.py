@@ -12,7 +12,7 @@ from robominer_slam.evaluation.run_record import RunRecord
 
 RUN_HEAD = (
     "run", "position error (m): mean", "median", "95 %", "largest", "heading (deg)", "odometry's mean (m)", "keyframes",
-    "true closures", "wrong", "height RMS (mm)", "within 99 % (%)", "x real time",
+    "true closures", "wrong", "height RMS (mm)", "within 99 % (%)", "tracking (%)", "x real time",
 )  # fmt: skip
 
 
@@ -53,6 +53,7 @@ def _run(run: RunRecord, with_seed: bool) -> list[str]:
         str(run.closures.wrong),
         "-" if run.height is None else f"{1e3 * run.height.rms_m:.1f}",
         f"{100.0 * run.consistency.share_within_99:.1f}",
+        f"{100.0 * run.states.get('tracking', 0.0):.1f}",
         f"{run.real_time_factor:.1f}",
     ]
 
