@@ -42,6 +42,7 @@ def run(
         duration_s=20.0,
         distance_m=5.0,
         replay_s=replay_s,
+        cpu_s=replay_s,
         slam_position_m=statistics(mean, largest),
         slam_heading_deg=statistics(2.0),
         odometry_position_m=statistics(odometry),

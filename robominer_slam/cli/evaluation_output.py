@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -65,13 +66,13 @@ def print_campaign(campaign: Campaign, folder: Path, as_json: bool, echo: Callab
 
 def print_table(records: Sequence[RunRecord]) -> None:
     """The acceptance table on stdout, methods side by side, a table for each source of odometry."""
-    console = Console()
     for text in text_tables(acceptance_table(records)):
+        # A pipe or file has no width: nothing is to be cut there.
+        console = Console(width=None if sys.stdout.isatty() else 60 + sum(len(name) + 6 for name in text.columns))
         table = Table(title=f"odometry: {text.source}; errors against the truth, without alignment")
         table.add_column("")
         for name in text.columns:
             table.add_column(name, justify="right", overflow="fold")
         for name, cells in text.lines:
             table.add_row(name, *cells)
-        # A pipe or file has no width: nothing is to be cut there.
-        console.print(table, width=None if console.is_terminal else 60 + 20 * len(text.columns))
+        console.print(table)

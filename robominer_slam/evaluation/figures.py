@@ -37,8 +37,8 @@ MARGIN_M = 0.15
 ARC_M = 0.25
 #: Room for the legend between axes and title, points.
 TITLE_PAD = 36.0
-#: Characters that a line of a legend has room for.
-LEGEND_CHARACTERS = 76
+#: What a line of a legend has room for, and what each entry takes beside its text.
+CHARACTERS_PER_INCH, SYMBOL_CHARACTERS = 13.0, 7
 
 
 @dataclass(frozen=True)
@@ -206,15 +206,12 @@ def _arc(start: FloatArray, end: FloatArray, height: float) -> FloatArray:
     return np.concatenate([line, np.full((1, 2), np.nan)])
 
 
-def legend_above(axes: Axes, columns: int | None = None, handles: Sequence[Artist] | None = None) -> None:
-    """The legend outside the axes, where it covers nothing; of the labelled artists, or of `handles`.
-
-    It has as many columns as fit on the narrowest figure here unless `columns` says how many.
-    """
+def legend_above(axes: Axes, handles: Sequence[Artist] | None = None) -> None:
+    """The legend outside the axes, where it covers nothing; of the labelled artists, or of `handles`."""
     shown = axes.get_legend_handles_labels()[0] if handles is None else list(handles)
-    if columns is None:
-        longest = max((len(str(one.get_label())) for one in shown), default=0)
-        columns = min(len(shown), max(1, LEGEND_CHARACTERS // (longest + 6)), 4)
+    longest = max((len(str(one.get_label())) for one in shown), default=0)
+    room = CHARACTERS_PER_INCH * axes.figure.bbox.width / axes.figure.dpi
+    columns = min(len(shown), max(1, int(room) // (longest + SYMBOL_CHARACTERS)), 4)
     axes.legend(
         handles=shown, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=columns, fontsize="small", frameon=False
     )

@@ -98,6 +98,7 @@ class RunRecord:
         duration_s: from the first to the last of them.
         distance_m: length of the true path.
         replay_s: time that the replay took, reading included.
+        cpu_s: processor time of it, of all threads; says more on a busy machine.
         slam_position_m, slam_heading_deg: of the poses as published.
         odometry_position_m, odometry_heading_deg: of the same run's dead reckoning.
         slam_distance_m, slam_rotation_deg: of the poses as published, in all three dimensions.
@@ -117,6 +118,7 @@ class RunRecord:
     duration_s: float
     distance_m: float
     replay_s: float
+    cpu_s: float
     slam_position_m: ErrorStatistics
     slam_heading_deg: ErrorStatistics
     odometry_position_m: ErrorStatistics

@@ -101,7 +101,9 @@ def evaluate_run(task: RunTask, surface_of: SurfaceOf | None = None) -> RunResul
     inputs = prepare(task.path, None)
     inputs = replace(inputs, configuration=task.configured(inputs.configuration))
     truth = truth_of(task.path)
+    cpu_start = time.process_time()
     frames, result, seconds = _replay(inputs)
+    cpu_s = time.process_time() - cpu_start
     if not frames.stamps:
         raise TrajectoryError(f"{task.path}: no whisker frames in it")
     stamps = np.array(frames.stamps, dtype=np.int64)
@@ -128,6 +130,7 @@ def evaluate_run(task: RunTask, surface_of: SurfaceOf | None = None) -> RunResul
         duration_s=float(stamps[-1] - stamps[0]) * 1e-9,
         distance_m=float(np.linalg.norm(np.diff(T_truth[:, :2, 3], axis=0), axis=1).sum()),
         replay_s=seconds,
+        cpu_s=cpu_s,
         slam_position_m=ErrorStatistics.of(slam_errors.position),
         slam_heading_deg=_heading(slam_errors),
         odometry_position_m=ErrorStatistics.of(odometry_errors.position),

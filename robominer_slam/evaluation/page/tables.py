@@ -11,8 +11,9 @@ from robominer_slam.evaluation.page.run_view import DriveViews
 from robominer_slam.evaluation.run_record import RunRecord
 
 RUN_HEAD = (
-    "run", "position error (m): mean", "median", "95 %", "largest", "heading (deg)", "odometry's mean (m)", "keyframes",
-    "true closures", "wrong", "height RMS (mm)", "within 99 % (%)", "tracking (%)", "x real time",
+    "odometry", "noise", "method", "position error (m): mean", "median", "95 %", "largest", "heading (deg)",
+    "odometry's mean (m)", "keyframes", "true closures", "wrong", "height RMS (mm)", "within 99 % (%)",
+    "tracking (%)", "x real time",
 )  # fmt: skip
 
 
@@ -31,20 +32,20 @@ def runs_html(views: Sequence[DriveViews]) -> str:
     rows = []
     for one in views:
         for name in dict.fromkeys(run.key.series for run in one.runs):
-            rows += [_run(run.record, len(one.seeds) > 1) for run in one.of_series(name)]
-    return _table(RUN_HEAD, rows)
+            rows += [_run(run.record) for run in one.of_series(name)]
+    return f'<div class="runs">{_table(RUN_HEAD, rows)}</div>'
 
 
 #: What the sources of odometry are, in words.
 SOURCES = {"fused": "fused from IMU and screws", "odometry": "the thesis's, ready-made with bias and noise"}
 
 
-def _run(run: RunRecord, with_seed: bool) -> list[str]:
-    name = f"{run.key.source}, {run.key.series}"
-    if with_seed and run.key.odometry_seed is not None:
-        name += f", noise {run.key.odometry_seed}"
+def _run(run: RunRecord) -> list[str]:
+    seed = run.key.odometry_seed
     return [
-        name,
+        run.key.source,
+        "-" if seed is None else str(seed),
+        run.key.series,
         *_statistics(run.slam_position_m),
         f"{run.slam_heading_deg.mean:.2f}",
         f"{run.odometry_position_m.mean:.3f}",
