@@ -137,7 +137,11 @@ def main() -> None:
     except (ConfigurationError, RecordingError, ResultsError, worlds.WorldError) as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
-    campaign = run_with_progress(tasks, arguments.out, arguments.jobs, surface_of)
+    try:
+        campaign = run_with_progress(tasks, arguments.out, arguments.jobs, surface_of)
+    except KeyboardInterrupt:
+        print("interrupted; the same command goes on from here", file=sys.stderr)
+        sys.exit(130)
     if arguments.report is not None and campaign.records:
         write_report(arguments.report, campaign.records, campaign.files)
     print_campaign(campaign, arguments.out, arguments.as_json)

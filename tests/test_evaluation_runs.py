@@ -286,6 +286,7 @@ def test_files_that_are_no_results_or_recordings(tmp_path):
     assert "not the results of an evaluation" in done.stderr
     (tmp_path / "a.mcap").write_bytes(b"nothing")
     assert "error: " in cli("run", tmp_path / "a.mcap", "--out", tmp_path, expect=2).stderr
+    assert "Options go behind 'report'" in cli("--json", "report", tmp_path / "r.json", expect=2).stderr
     assert "Missing option '--truth'" in cli("--odometry", tmp_path / "r.json", expect=2).stderr
 
 

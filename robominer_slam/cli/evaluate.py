@@ -58,6 +58,8 @@ def evaluate(
     replayed with several methods; with `report` for saved results of `run`.
     """
     if context.invoked_subcommand is not None:
+        if as_json or any((truth, odometry, slam, graph_file, figure)):
+            raise click.UsageError(f"Options go behind '{context.invoked_subcommand}'.")
         return
     if truth is None or odometry is None or slam is None:
         given = {"--truth": truth, "--odometry": odometry, "--slam": slam}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import multiprocessing
+import signal
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -137,8 +138,10 @@ def run_tasks(
             found[k] = _one(task, folder, code, surface_of)
             on_done(task)
     else:
-        # A fresh interpreter: threads of a progress bar do not survive a fork.
-        with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        # A fresh interpreter: threads of a progress bar do not survive a fork. Ctrl-C is this process's: runs that have
+        # begun are finished and saved, the others are not begun.
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(jobs, context, signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
             waiting: dict[Future[tuple[RunRecord, bool] | Failure], int] = {
                 pool.submit(_one, task, folder, code, surface_of): k for k, task in enumerate(tasks)
             }
@@ -168,7 +171,7 @@ def _one(task: RunTask, folder: Path, code: str, surface_of: SurfaceOf | None) -
     """The record of a run, and whether it was there from before."""
     path = folder / RUNS / task.file_name
     try:
-        fingerprint = task.fingerprint(code, surface_of is not None)
+        fingerprint = task.fingerprint(code, surface_of)
         record = saved_record(path, fingerprint)
         if record is not None:
             return record, True

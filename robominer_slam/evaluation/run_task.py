@@ -34,6 +34,8 @@ SurfaceOf = Callable[[Mapping[str, str]], HeightFunction | None]
 
 #: Cells of the map that is kept for the figures, m.
 FIGURE_CELL_M = 0.02
+#: Places in x and y at which the true surface is told from another, m.
+SAMPLED_M = np.linspace(-1.0, 4.0, 21)
 #: Frames over which drift is measured: a second of whisker frames.
 RELATIVE_FRAMES = 25
 
@@ -61,11 +63,15 @@ class RunTask:
         keys = {"slam.method": self.key.method, "estimation.source": self.key.source, **dict(self.overrides)}
         return overridden(configuration, keys, self.path.name)
 
-    def fingerprint(self, code: str, with_surface: bool) -> str:
-        """Tells whether a saved run was made from the same recording, configuration and program."""
-        configuration = self.configured(prepare(self.path, None).configuration)
+    def fingerprint(self, code: str, surface_of: SurfaceOf | None) -> str:
+        """Tells whether a saved run was made from the same recording, configuration, program and true surface."""
+        inputs = prepare(self.path, None)
         recording = hashlib.sha256(self.path.read_bytes()).hexdigest()
-        parts = [code, recording, configuration.model_dump_json(), repr(self.key), str(with_surface)]
+        surface = surface_of(inputs.recording.metadata) if surface_of is not None else None
+        # Two surfaces that agree at so many places are the same.
+        heights = "" if surface is None else repr(np.round(surface(*np.meshgrid(SAMPLED_M, SAMPLED_M)), 9).tolist())
+        configuration = self.configured(inputs.configuration).model_dump_json()
+        parts = [code, recording, configuration, repr(self.key), heights]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
