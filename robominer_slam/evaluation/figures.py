@@ -38,7 +38,7 @@ ARC_M = 0.25
 #: Room for the legend between axes and title, points.
 TITLE_PAD = 36.0
 #: What a line of a legend has room for, and what each entry takes beside its text.
-CHARACTERS_PER_INCH, SYMBOL_CHARACTERS = 13.0, 7
+CHARACTERS_PER_INCH, SYMBOL_CHARACTERS = 13.6, 7
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,8 @@ FloatArray = NDArray[np.float64]
 MARGIN_M = 0.3
 #: Paths that stray further than this from the truth are cut, or nothing else could be seen, m.
 STRAY_M = 1.0
+#: A straight drive still gets this much room across it, m.
+MIN_SPAN_M = 1.2
 #: Inches beside the axes: labels left, and colour bar right.
 BESIDE_IN = 0.9
 #: Inches above and below: legend of two lines, labels.
@@ -59,7 +61,8 @@ def window_of(truth: FloatArray, others: Sequence[FloatArray]) -> Window:
     everything = np.concatenate([truth, *others])
     low = np.maximum(everything.min(axis=0), truth.min(axis=0) - STRAY_M) - MARGIN_M
     high = np.minimum(everything.max(axis=0), truth.max(axis=0) + STRAY_M) + MARGIN_M
-    return Window(low, high)
+    missing = np.maximum(MIN_SPAN_M - (high - low), 0.0) / 2.0
+    return Window(low - missing, high + missing)
 
 
 def paths(runs: Sequence[RunView], odometry: RunView, styles: Mapping[str, Style], window: Window) -> Figure:
