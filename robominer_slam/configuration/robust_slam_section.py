@@ -73,7 +73,7 @@ class ClosureSection(Section):
     max_moved: float = parameter(
         4.0, "1", "distance from the prediction in sigmas, three axes: 0.1 % by chance", low=1.0, high=100.0
     )
-    max_sigma: float = parameter(0.03, "m", "a match that leaves a direction free is none", low=0.001, high=1.0)
+    max_sigma: float = parameter(0.02, "m", "a match that leaves a direction free is none", low=0.001, high=1.0)
     max_sigma_yaw_deg: float = parameter(2.0, "deg", "as max_sigma", low=0.1, high=45.0)
     inflation: float = parameter(
         40.0, "1", "touches share errors, and so do patches that follow each other: variance over that of independence", low=1.0, high=1000.0
