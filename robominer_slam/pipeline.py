@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import replace
@@ -260,4 +261,5 @@ def planar_pose(state: OdometryState) -> FloatArray:
     """Pose of base_link in odom, shape (4, 4): in space where it is known so, else in the plane."""
     if state.T_odom_base is not None:
         return state.T_odom_base
-    return geometry.T_from_xyyaw([state.x, state.y, state.yaw])
+    c, s = math.cos(state.yaw), math.sin(state.yaw)
+    return np.array([[c, -s, 0.0, state.x], [s, c, 0.0, state.y], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])

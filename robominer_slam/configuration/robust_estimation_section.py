@@ -37,7 +37,11 @@ class RobustEstimationSection(Section):
     drag_sigma_slide: float = parameter(0.8, "rad", "how far a ground's value is from that", low=1e-3, high=10.0)
     drag_slide_length: float = parameter(10.0, "m", "way over which the ground's value changes", low=0.1, high=1e4)
     drag_min_inclination_deg: float = parameter(
-        8.0, "deg", "a rod less inclined has no clear direction: noise of 0.4 deg would turn it by 3", low=2.0, high=45.0
+        8.0,
+        "deg",
+        "a rod less inclined has no clear direction: noise of 0.4 deg would turn it by 3",
+        low=2.0,
+        high=45.0,
     )
     drag_mount_tilt_deg: float = parameter(
         30.0, "deg", "mounts farther from straight down are for walls", low=1.0, high=89.0
@@ -86,7 +90,9 @@ class RobustEstimationSection(Section):
         0.0005, "m", "what scan matches have in common: a row's whiskers err by 1.2 mm each against the next row's",
         low=0.0, high=0.1,
     )  # fmt: skip
-    sigma_match_yaw_deg: float = parameter(0.12, "deg", "as sigma_match, over the array's half width", low=0.0, high=5.0)
+    sigma_match_yaw_deg: float = parameter(
+        0.12, "deg", "as sigma_match, over the array's half width", low=0.0, high=5.0
+    )
     match_length: float = parameter(3.0, "m", "way over which that stays the same", low=0.01, high=100.0)
     gate: float = parameter(
         16.0, "1", "squared Mahalanobis distance (three axes) beyond which a measurement loses weight: 0.1 % by chance",

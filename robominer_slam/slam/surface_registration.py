@@ -47,7 +47,7 @@ class SurfaceMatch:
         inliers: share of those whose residual is within three sigmas.
         rms: of the inliers' residuals, m.
         cost: mean squared residual, each at most three sigmas, m2: what places are compared by.
-        relief: standard deviation of the surface's heights under the touches, its common tilt left out, m.
+        heights: of the surface under the touches on it, with their x and y: shape (k, 3), m.
     """
 
     pose: FloatArray
@@ -58,7 +58,16 @@ class SurfaceMatch:
     inliers: float
     rms: float
     cost: float
-    relief: float
+    heights: FloatArray
+
+    @property
+    def relief(self) -> float:
+        """Standard deviation of the surface's heights under the touches, its common tilt left out, m."""
+        if len(self.heights) < 4:
+            return 0.0
+        plane = np.column_stack([np.ones(len(self.heights)), self.heights[:, :2] - self.heights[:, :2].mean(axis=0)])
+        tilt, *_ = np.linalg.lstsq(plane, self.heights[:, 2], rcond=None)
+        return float(np.std(self.heights[:, 2] - plane @ tilt))
 
 
 def placed(points: FloatArray, pose: FloatArray) -> FloatArray:
@@ -103,7 +112,9 @@ def fit(
         known = patches.known
         if int(known.sum()) < 4:
             nothing = np.zeros((4, 4))
-            return SurfaceMatch(pose, nothing, nothing, np.zeros(4), float(known.mean()), 0.0, 0.0, np.inf, 0.0)
+            return SurfaceMatch(
+                pose, nothing, nothing, np.zeros(4), float(known.mean()), 0.0, 0.0, np.inf, np.zeros((0, 3))
+            )
         r = q[known, 2] - patches.height[known]
         J = residual_jacobian(q[known], pose, patches.slope[known])
         inverse_variance = 1.0 / patches.variance[known]
@@ -166,9 +177,5 @@ def _judged(
     fits = np.abs(residual) < limit
     cost = float(np.mean(np.minimum(residual**2, limit**2)))
     rms = float(np.sqrt(np.mean(residual[fits] ** 2))) if fits.any() else 0.0
-    heights = patches.height[known]
-    xy = q[known, :2] - q[known, :2].mean(axis=0)
-    plane = np.column_stack([np.ones(len(xy)), xy])
-    tilt, *_ = np.linalg.lstsq(plane, heights, rcond=None)
-    relief = float(np.std(heights - plane @ tilt))
-    return SurfaceMatch(pose, *H, gradient, float(known.mean()), float(fits.mean()), rms, cost, relief)
+    heights = np.column_stack([q[known, :2], patches.height[known]])
+    return SurfaceMatch(pose, *H, gradient, float(known.mean()), float(fits.mean()), rms, cost, heights)
