@@ -69,11 +69,13 @@ class DragInformation:
         information: shape (3, 3); singular along the motion itself, of which the tips say nothing.
         vector: information times the correction of the velocity, shape (3,).
         tips: how many counted.
+        ahead: direction of motion that it was linearised at, unit vector, shape (2,).
     """
 
     information: FloatArray
     vector: FloatArray
     tips: int
+    ahead: FloatArray
 
     def compressed(self) -> tuple[FloatArray, FloatArray]:
         """Rows H (k, 3) and innovations (k,) with unit covariance that say the same; k of 0 to 3."""
@@ -154,18 +156,20 @@ class DragDirection:
         if direction is None or direction @ scaled < SAME_DIRECTION * size:
             direction, self._shown_way = scaled / size, 0.0
         new_way = self._shown_way < settings.drag_length
-        found = self._information(tips, velocity, direction / METRIC * size)
+        at = direction / METRIC * size
+        found = self._information(tips, velocity, at)
         shown = self._shown(found, velocity, covariance)
         self._shown_way += way
         direction = direction + way / min(self._shown_way, SHOWN_LENGTH) * (shown - direction)
         self._direction = direction / math.sqrt(direction @ direction)
-        if new_way:
+        speed = math.hypot(at[0], at[1])
+        if new_way or speed < settings.drag_least_speed:
             return None
         self._learn_slide(found, covariance, min(1.0, way / (2.0 * settings.drag_length)))
         discount = min(1.0, way / (2.0 * settings.drag_length))
         shared = np.linalg.inv(np.eye(3) + found.information @ self._common(velocity)) * discount
         information = shared @ found.information
-        return DragInformation(0.5 * (information + information.T), shared @ found.vector, found.tips)
+        return DragInformation(0.5 * (information + information.T), shared @ found.vector, found.tips, at[:2] / speed)
 
     def _trailing(self, contacts: Contacts, old: Contacts, span: float, velocity: FloatArray) -> _Tips | None:
         index = contacts.index

@@ -21,7 +21,7 @@ from robominer_slam import geometry
 from robominer_slam.configuration.robust_estimation_section import RobustEstimationSection
 from robominer_slam.contacts import Contacts
 from robominer_slam.estimation.drag_direction import DragDirection
-from robominer_slam.estimation.gyro_batch import GyroBatch
+from robominer_slam.estimation.imu_batch import ImuBatch
 from robominer_slam.estimation.keyframe_motion import KeyframeMotion
 from robominer_slam.estimation.odometry_state import OdometryState
 from robominer_slam.estimation.planar_motion import (
@@ -43,6 +43,7 @@ from robominer_slam.estimation.planar_motion import (
     compose_jacobian,
 )
 from robominer_slam.estimation.screw_speeds import ScrewSpeedAssembly
+from robominer_slam.estimation.tilt import Tilt, cross
 
 FloatArray = NDArray[np.float64]
 Source = Literal["fused", "odometry"]
@@ -57,8 +58,8 @@ TURN_WINDOW_S = 0.2
 SIGMA_START = np.array([0.01, 0.01, 0.01])
 #: More slip than this is a robot that is stuck: the model ends there.
 MAX_SLIP = 0.9
-#: Deviations of what a level body is taken to have: z per keyframe (m), roll and pitch (rad).
-SIGMA_Z, SIGMA_TILT = 0.005, 0.005
+#: Rows of a twist (translation first) that the planar filter knows.
+PLANAR = [0, 1, 5]
 
 
 def screw_turn(state: FloatArray, gyro_angle: float, span: float) -> FloatArray:
@@ -118,7 +119,11 @@ class RobustOdometry:
             self._H_odometry[:, ODOMETRY_BIAS] = np.eye(3)
         self._R_screws = (screw_matrix[:3] @ screw_matrix[:3].T) * settings.sigma_screw_speed**2
         self._speeds = ScrewSpeedAssembly()
-        self._gyro = GyroBatch()
+        self._imu = ImuBatch()
+        self._tilt = Tilt(settings.tilt_time_constant) if fused else None
+        self._tilt_rotation = self._tilt_at_key = np.eye(3)
+        self._velocity_before = np.zeros(3)
+        self._z = self._z_at_key = self._way = self._way_at_key = 0.0
         self._stamp_ns: int | None = None
         self._screws: ScrewAngles | None = None
         self._odometry_ns: int | None = None
@@ -138,7 +143,7 @@ class RobustOdometry:
             return
         match measurement:
             case ImuSample():
-                self._add_imu(measurement)
+                self._imu.add(measurement)
             case ScrewAngles():
                 self._add_angles(measurement)
             case ScrewSpeeds():
@@ -160,18 +165,15 @@ class RobustOdometry:
         rows, innovation = found.compressed()
         H = np.zeros((len(rows), len(self._filter.x)))
         H[:, VELOCITY] = rows
-        ekf.correct(innovation, H, np.eye(len(rows)), self._along_motion())
+        ekf.correct(innovation, H, np.eye(len(rows)), self._along_motion(found.ahead))
 
-    def _along_motion(self) -> FloatArray:
-        """Combinations of states that are motion ahead, shape (k, n): the drag's angle must not move them.
+    def _along_motion(self, ahead: FloatArray) -> FloatArray:
+        """Combinations of states that are motion `ahead`, shape (k, n): the drag's angle must not move them.
 
         Its derivative by them is zero but for noise in the direction, which repeated updates would take for
         knowledge of the speed.
         """
         x = self._filter.x
-        vx, vy = x[VX], x[VY]
-        size = max(math.hypot(vx, vy), 1e-9)
-        ahead = np.array([vx, vy]) / size
         c, s = math.cos(x[YAW]), math.sin(x[YAW])
         if self._source == "odometry":
             held = np.zeros((3, len(x)))
@@ -208,6 +210,8 @@ class RobustOdometry:
             x[VELOCITY].copy(),
             J @ P @ J.T,
             P[VELOCITY, VELOCITY].copy(),
+            None if self._tilt is None else self._pose(pose, self._z, self._tilt_rotation),
+            self._covariance(J @ P @ J.T, self._way),
         )
 
     def mark_keyframe(self, stamp_ns: int) -> KeyframeMotion:
@@ -220,14 +224,18 @@ class RobustOdometry:
         P_bias = P[b, b].copy()
         by_bias = np.linalg.solve(P_bias + 1e-18 * np.eye(len(P_bias)), P[b, REL]).T
         conditional = P[REL, REL] - by_bias @ P[b, REL]
-        covariance = np.diag([0.0, 0.0, SIGMA_Z**2, SIGMA_TILT**2, SIGMA_TILT**2, 0.0])
-        planar = [0, 1, 5]
-        covariance[np.ix_(planar, planar)] = to_new @ conditional @ to_new.T
+        covariance = self._covariance(to_new @ conditional @ to_new.T, self._way - self._way_at_key)
         jacobian = np.zeros((6, len(P_bias)))
-        jacobian[planar] = to_new @ by_bias
+        jacobian[PLANAR] = to_new @ by_bias
+        level = self._pose(x[REL], self._z - self._z_at_key, self._tilt_rotation)
+        T = level.copy()
+        T[:3] = self._tilt_at_key.T @ level[:3]
+        # From the levelled frame to base_link.
+        turn = np.kron(np.eye(2), self._tilt_rotation.T)
+        covariance, jacobian = turn @ covariance @ turn.T, turn @ jacobian
         motion = KeyframeMotion(
             stamp_ns,
-            geometry.T_from_xyyaw(x[REL]),
+            T,
             0.5 * (covariance + covariance.T),
             jacobian,
             x[b].copy(),
@@ -235,7 +243,25 @@ class RobustOdometry:
             P_bias,
         )
         self._filter.keyframe()
+        self._tilt_at_key, self._z_at_key, self._way_at_key = self._tilt_rotation, self._z, self._way
         return motion
+
+    def _covariance(self, planar: FloatArray, way: float) -> FloatArray:
+        """Covariance (6, 6) of x, y, z, roll, pitch, yaw from that of x, y, yaw, after a way in m."""
+        settings = self._settings
+        tilt = math.radians(settings.sigma_tilt_deg) ** 2
+        covariance = np.zeros((6, 6))
+        covariance[np.ix_(PLANAR, PLANAR)] = planar
+        covariance[2, 2] = settings.height_walk**2 * (way + 0.01) + (tilt * way * way if self._tilt else 0.0)
+        covariance[3, 3] = covariance[4, 4] = tilt
+        return covariance
+
+    @staticmethod
+    def _pose(planar: FloatArray, z: float, tilt: FloatArray) -> FloatArray:
+        T = geometry.T_from_xyyaw(planar)
+        T[:2, :3] = T[:2, :2] @ tilt[:2]
+        T[2, :3], T[2, 3] = tilt[2], z
+        return T
 
     @property
     def bias(self) -> FloatArray:
@@ -246,10 +272,6 @@ class RobustOdometry:
     def outliers(self) -> int:
         """Measurements beyond the gate."""
         return self._filter.outliers
-
-    def _add_imu(self, sample: ImuSample) -> None:
-        if sample.gyro is not None:
-            self._gyro.add(sample.stamp_ns, sample.gyro)
 
     def _add_odometry(self, sample: OdometrySample) -> None:
         previous, self._odometry_ns = self._odometry_ns, sample.stamp_ns
@@ -339,24 +361,42 @@ class RobustOdometry:
         gyro = screws = None
         kept = 1.0
         if self._source == "fused":
-            samples = max(self._gyro.samples, 1)
-            rate = self._gyro.mean(previous, stamp_ns)
-            if rate is not None:
-                gyro = float(rate[2])
-                Q_velocity[2, 2] = settings.sigma_gyro**2 / samples
-                if self._turn_gyro is not None:
-                    self._turn_gyro += gyro * dt
-                    self._turn_span += dt
-                    self._turn_variance += Q_velocity[2, 2] * dt * dt
-            else:
-                self._turn_gyro = None
+            gyro = self._turn(previous, stamp_ns, dt, Q_velocity)
             if self._screws_ns is not None and stamp_ns - self._screws_ns < MAX_INTERVAL_S * 1e9:
                 screws = self._input
                 Q_velocity[:2, :2] = self._Q_input
             q[GYRO_BIAS] = settings.gyro_bias_walk**2 * dt
-            way += abs(float(x[WZ])) * dt * settings.slip_turn_arm
-            kept = math.exp(-way / settings.slip_length)
+            turned = way + abs(float(x[WZ])) * dt * settings.slip_turn_arm
+            kept = math.exp(-turned / settings.slip_length)
             q[SLIP] = settings.sigma_slip**2 * (1.0 - kept * kept)
         else:
             q[ODOMETRY_BIAS] = settings.odometry_bias_walk**2 * dt
-        ekf.move(Inputs(dt, gyro, screws), Q_velocity, q, kept)
+        self._way += way
+        ekf.move(Inputs(dt, gyro, screws, self._tilt_rotation[:2, :2]), Q_velocity, q, kept)
+        climb = self._tilt_rotation[2]
+        self._z += float(climb[0] * ekf.x[VX] + climb[1] * ekf.x[VY]) * dt
+
+    def _turn(self, from_ns: int, until_ns: int, dt: float, Q_velocity: FloatArray) -> float | None:
+        """Take the IMU's samples of an interval: roll and pitch go on; returns the turn rate with its bias, rad/s."""
+        imu, tilt = self._imu, self._tilt
+        assert tilt is not None
+        samples = max(imu.samples, 1)
+        rate = imu.mean_rate(from_ns, until_ns)
+        acceleration = imu.mean_acceleration()
+        if rate is not None or acceleration is not None:
+            x = self._filter.x
+            now = np.array([x[VX], x[VY], 0.0])
+            own = (now - self._velocity_before) / dt + cross(np.array([0.0, 0.0, x[WZ]]), now)
+            self._velocity_before = now
+            tilt.move(dt, rate, acceleration, own, imu.orientation_xyzw)
+            self._tilt_rotation = tilt.rotation()
+        if rate is None:
+            self._turn_gyro = None
+            return None
+        Q_velocity[2, 2] = self._settings.sigma_gyro**2 / samples
+        gyro = tilt.turn_rate(rate)
+        if self._turn_gyro is not None:
+            self._turn_gyro += gyro * dt
+            self._turn_span += dt
+            self._turn_variance += Q_velocity[2, 2] * dt * dt
+        return gyro
