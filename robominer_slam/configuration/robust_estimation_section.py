@@ -83,7 +83,7 @@ class RobustEstimationSection(Section):
     )
     sigma_still: float = parameter(0.002, "m/s, rad/s", "creep of a robot whose screws stand", low=1e-5, high=0.1)
     tilt_time_constant: float = parameter(
-        40.0, "s", "averages the specific force's noise; a BNO080's gyro drifts by 0.5 deg in it", low=0.5, high=300.0
+        5.0, "s", "averages the specific force's noise; a BNO080's gyro drifts by 0.3 deg in it", low=0.5, high=300.0
     )
     sigma_tilt_deg: float = parameter(
         0.3, "deg", "of roll and pitch: the accelerometer's bias of 0.03 m/s2 is 0.2 deg", low=0.01, high=10.0

@@ -101,6 +101,8 @@ class DragDirection:
         self._least_inclination = math.radians(settings.drag_min_inclination_deg)
         self._sigma2 = math.radians(settings.drag_sigma_deg) ** 2
         self._slopes = CrossSlope(layout, self._floor)
+        #: Horizontal parts of the mounts' axes times the rods' lengths, shape (3 axes, 2, n).
+        self._columns = np.ascontiguousarray(layout.R_base_whisker[:, :2].transpose(2, 1, 0)) * layout.length
         self._frames: deque[tuple[int, Contacts]] = deque(maxlen=WINDOW + 1)
         self._way = 0.0
         self._last_ns: int | None = None
@@ -113,12 +115,10 @@ class DragDirection:
     def reach(self, contacts: Contacts) -> FloatArray:
         """Horizontal vectors from base to tip, shape (2, m), m, in base_link."""
         sine = np.sin(contacts.inclination)
-        direction = np.stack(
-            [sine * np.cos(contacts.azimuth), sine * np.sin(contacts.azimuth), np.cos(contacts.inclination)], axis=1
-        )
-        R = self._layout.R_base_whisker[contacts.index, :2]
-        rod: FloatArray = np.matmul(R, direction[:, :, None])[:, :, 0].T
-        return rod * self._layout.length[contacts.index]
+        x, y, z = sine * np.cos(contacts.azimuth), sine * np.sin(contacts.azimuth), np.cos(contacts.inclination)
+        columns = self._columns[:, :, contacts.index]
+        rod: FloatArray = columns[0] * x + columns[1] * y + columns[2] * z
+        return rod
 
     def measure(
         self, stamp_ns: int, contacts: Contacts, velocity: FloatArray, covariance: FloatArray

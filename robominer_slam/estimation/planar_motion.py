@@ -191,7 +191,10 @@ class PlanarFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has 
         """
         PHT = self.P @ H.T
         S = H @ PHT + R
-        distance = float(innovation @ np.linalg.solve(S, innovation))
+        if len(innovation) == 1:
+            distance = float(innovation[0] ** 2 / S[0, 0])
+        else:
+            distance = float(innovation @ np.linalg.solve(S, innovation))
         if distance > self.gate:
             self.outliers += 1
             R = R * (distance / self.gate)

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.measurement import ImuSample, Measurement, OdometrySample, ScrewAngles, ScrewSpeeds
-from robominer_slam import geometry
 from robominer_slam.configuration.robust_estimation_section import RobustEstimationSection
 from robominer_slam.contacts import Contacts
 from robominer_slam.estimation.drag_direction import DragDirection
@@ -133,10 +132,12 @@ class RobustOdometry:
         self._turn_gyro: float | None = None
         self._turn_screws = self._turn_span = 0.0
         self._turn_readings, self._turn_still = 0, True
+        self._state: OdometryState | None = None
         self.stale = 0
 
     def add(self, measurement: Measurement) -> None:
         """Take a measurement of the source; others are ignored."""
+        self._state = None
         if self._source == "odometry":
             if isinstance(measurement, OdometrySample):
                 self._add_odometry(measurement)
@@ -162,6 +163,7 @@ class RobustOdometry:
         found = self._drag.measure(stamp_ns, contacts, ekf.x[VELOCITY], ekf.P[VELOCITY, VELOCITY])
         if found is None:
             return
+        self._state = None
         rows, innovation = found.compressed()
         H = np.zeros((len(rows), len(self._filter.x)))
         H[:, VELOCITY] = rows
@@ -199,20 +201,24 @@ class RobustOdometry:
     def state_at(self, stamp_ns: int) -> OdometryState:
         """The state at a time that is not before the last measurement's."""
         self._predict(stamp_ns)
+        if self._state is not None and self._state.stamp_ns == stamp_ns:
+            return self._state
         x, P = self._filter.x, self._filter.P
         pose = compose(x)
         J = compose_jacobian(x)
-        return OdometryState(
+        covariance = J @ P @ J.T
+        self._state = OdometryState(
             stamp_ns,
             float(pose[0]),
             float(pose[1]),
             float(pose[2]),
             x[VELOCITY].copy(),
-            J @ P @ J.T,
+            covariance,
             P[VELOCITY, VELOCITY].copy(),
             None if self._tilt is None else self._pose(pose, self._z, self._tilt_rotation),
-            self._covariance(J @ P @ J.T, self._way),
+            self._covariance(covariance, self._way),
         )
+        return self._state
 
     def mark_keyframe(self, stamp_ns: int) -> KeyframeMotion:
         """Motion since the last mark (or the start); the present pose becomes the new reference."""
@@ -243,6 +249,7 @@ class RobustOdometry:
             P_bias,
         )
         self._filter.keyframe()
+        self._state = None
         self._tilt_at_key, self._z_at_key, self._way_at_key = self._tilt_rotation, self._z, self._way
         return motion
 
@@ -251,16 +258,19 @@ class RobustOdometry:
         settings = self._settings
         tilt = math.radians(settings.sigma_tilt_deg) ** 2
         covariance = np.zeros((6, 6))
-        covariance[np.ix_(PLANAR, PLANAR)] = planar
+        covariance[:2, :2] = planar[:2, :2]
+        covariance[:2, 5], covariance[5, :2], covariance[5, 5] = planar[:2, 2], planar[2, :2], planar[2, 2]
         covariance[2, 2] = settings.height_walk**2 * (way + 0.01) + (tilt * way * way if self._tilt else 0.0)
         covariance[3, 3] = covariance[4, 4] = tilt
         return covariance
 
     @staticmethod
     def _pose(planar: FloatArray, z: float, tilt: FloatArray) -> FloatArray:
-        T = geometry.T_from_xyyaw(planar)
-        T[:2, :3] = T[:2, :2] @ tilt[:2]
-        T[2, :3], T[2, 3] = tilt[2], z
+        c, s = math.cos(planar[2]), math.sin(planar[2])
+        T = np.eye(4)
+        T[:2, :3] = np.array([[c, -s], [s, c]]) @ tilt[:2]
+        T[2, :3] = tilt[2]
+        T[:3, 3] = planar[0], planar[1], z
         return T
 
     @property
