@@ -50,10 +50,7 @@ def fused_run(rng: np.random.Generator, seconds: float, settings: RobustEstimati
         screws = np.array([0.18, 0.03 * math.sin(0.2 * k * STEP_S + phase[1])]) * driving
         noise = root @ rng.normal(size=3)
         grip = 1.0 - slip_mean - slip
-        if driving:
-            moving = grip[:2] * screws + noise[:2]
-        else:
-            moving = rng.normal(0.0, settings.sigma_still, 2)
+        moving = grip[:2] * screws + noise[:2] if driving else rng.normal(0.0, settings.sigma_still, 2)
         way = math.hypot(*moving) * STEP_S
         walked = rng.normal(0.0, settings.position_walk * math.sqrt(way), 2)
         pose = geometry.se2_compose(pose, geometry.se2_exp(np.array([*moving, turn]) * STEP_S))

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.util
 import math
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,8 +26,9 @@ from robominer_slam.estimation.planar_motion import (
     motion,
     motion_jacobian,
 )
-from robominer_slam.estimation.robust_odometry import RobustOdometry, screw_turn, screw_turn_jacobian
+from robominer_slam.estimation.robust_odometry import RobustOdometry
 from robominer_slam.estimation.screw_kinematics import forward_matrix
+from robominer_slam.estimation.turn_comparison import screw_turn, screw_turn_jacobian
 
 MATRIX = forward_matrix(0.078, math.radians(30.0), 0.15, 0.30)
 STEP_NS = 10_000_000
@@ -93,6 +97,18 @@ def drive(
 
 def end(odometry: RobustOdometry, seconds: float):
     return odometry.state_at(round(seconds * 1e9))
+
+
+@pytest.mark.parametrize("source", ["fused", "odometry"])
+def test_the_covariance_is_honest_under_the_filters_own_model(source):
+    path = Path(__file__).resolve().parents[1] / "benchmarks" / "filter_consistency.py"
+    spec = importlib.util.spec_from_file_location("filter_consistency", path)
+    study = importlib.util.module_from_spec(spec)
+    sys.modules["filter_consistency"] = study
+    spec.loader.exec_module(study)
+    share, mean = study.share_within(source, runs=20, seconds=12.0)
+    assert share > 0.85
+    assert 2.0 < mean < 4.0
 
 
 def test_screws_that_stand_reveal_the_gyro_bias():
@@ -167,7 +183,7 @@ def test_bias_jacobian_says_what_another_bias_would_have_made():
     odometry.add(OdometrySample(0, np.zeros(3)))
     for i in range(1, 91):
         odometry.add(OdometrySample(i * 33_333_333, np.array([0.15, 0.0, 0.0])))
-    odometry.mark_keyframe(round(90 * 33_333_333))
+    odometry.mark_keyframe(90 * 33_333_333)
     for i in range(91, 181):
         odometry.add(OdometrySample(i * 33_333_333, np.array([0.15, 0.0, 0.0])))
     made = odometry.mark_keyframe(180 * 33_333_333)
@@ -196,3 +212,20 @@ def test_a_climb_raises_the_robot():
     state = end(drive(seconds=20.0, gravity=gravity), 25.0)
     assert state.T_odom_base[2, 3] == pytest.approx(3.0 * math.sin(math.radians(10.0)), abs=0.06)
     assert state.x == pytest.approx(3.0 * math.cos(pitch), abs=0.06)
+
+
+def test_without_an_imu_the_screws_turn_the_robot():
+    odometry = RobustOdometry(RobustEstimationSection(), "fused", None, MATRIX)
+    speed = np.linalg.inv(MATRIX) @ np.array([0.15, 0.0, 0.2, 0.0]) / (1.0 - 0.16)
+    for i in range(501):
+        odometry.add(ScrewAngles(i * 20_000_000, speed * i * 0.02))
+    assert odometry.state_at(10_000_000_000).yaw == pytest.approx(2.0, abs=0.1)
+
+
+def test_a_jump_of_an_encoder_moves_nothing():
+    odometry = RobustOdometry(RobustEstimationSection(), "fused", None, MATRIX)
+    for i in range(101):
+        angle = np.zeros(4) if i < 50 else np.array([0.0, 0.0, 400.0, 400.0])
+        odometry.add(ScrewAngles(i * 20_000_000, angle))
+    assert abs(odometry.state_at(2_000_000_000).x) < 0.01
+    assert odometry.stale == 1

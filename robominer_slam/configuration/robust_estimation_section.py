@@ -37,7 +37,11 @@ class RobustEstimationSection(Section):
     drag_sigma_slide: float = parameter(0.8, "rad", "how far a ground's value is from that", low=1e-3, high=10.0)
     drag_slide_length: float = parameter(10.0, "m", "way over which the ground's value changes", low=0.1, high=1e4)
     drag_min_inclination_deg: float = parameter(
-        8.0, "deg", "a rod less inclined has no clear direction: noise of 0.4 deg would turn it by 3", low=2.0, high=45.0
+        8.0,
+        "deg",
+        "a rod less inclined has no clear direction: noise of 0.4 deg would turn it by 3",
+        low=2.0,
+        high=45.0,
     )
     drag_mount_tilt_deg: float = parameter(
         30.0, "deg", "mounts farther from straight down are for walls", low=1.0, high=89.0
@@ -77,6 +81,9 @@ class RobustEstimationSection(Section):
     slip_turn_arm: float = parameter(0.3, "m", "turning by 1 rad passes so much ground", low=0.0, high=2.0)
     slip_mode_weight: float = parameter(
         0.5, "1", "share of the screws' slip mode that is taken as error of each velocity", low=0.0, high=10.0
+    )
+    fastest: float = parameter(
+        2.0, "m/s", "ten times RM3's speed: screws that say more have a jump in their encoders", low=0.1, high=100.0
     )
     still_screw_speed: float = parameter(
         0.05, "rad/s", "all screws slower than this: the robot stands, velocity zero", low=0.0, high=10.0

@@ -157,7 +157,7 @@ class DragDirection:
             direction, self._shown_way = scaled / size, 0.0
         new_way = self._shown_way < settings.drag_length
         at = direction / METRIC * size
-        found = self._information(tips, velocity, at)
+        found = self._information(tips, at)
         shown = self._shown(found, velocity, covariance)
         self._shown_way += way
         direction = direction + way / min(self._shown_way, SHOWN_LENGTH) * (shown - direction)
@@ -192,8 +192,8 @@ class DragDirection:
         gradient = self._slopes.gradient(contacts.points, index)
         return _Tips(p[:, ok], turning[:, ok], d[:, ok], gradient[:, ok], swept[:, ok])
 
-    def _information(self, tips: _Tips, velocity: FloatArray, at: FloatArray) -> _Frame:
-        """What the tips say about the velocity's difference from `velocity`, linearised at `at`."""
+    def _information(self, tips: _Tips, at: FloatArray) -> _Frame:
+        """What the tips say about the velocity's difference from its estimate, linearised at `at`."""
         rows, angle, cross, speed, weight = self._linearised(tips, _swept(tips.p, tips.turning, at))
         steady = tips.swept - tips.turning
         innovation = angle * speed - (rows[0] * steady[0] + rows[1] * steady[1])

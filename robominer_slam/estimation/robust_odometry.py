@@ -33,16 +33,17 @@ from robominer_slam.estimation.planar_motion import (
     VX,
     VY,
     WZ,
-    X,
-    Y,
     YAW,
     Inputs,
     PlanarFilter,
+    X,
+    Y,
     compose,
     compose_jacobian,
 )
 from robominer_slam.estimation.screw_speeds import ScrewSpeedAssembly
-from robominer_slam.estimation.tilt import Tilt, cross
+from robominer_slam.estimation.spatial_pose import SpatialPose
+from robominer_slam.estimation.turn_comparison import TurnComparison
 
 FloatArray = NDArray[np.float64]
 Source = Literal["fused", "odometry"]
@@ -51,29 +52,10 @@ Source = Literal["fused", "odometry"]
 MAX_INTERVAL_S = 0.5
 #: Slow states with a ready-made odometry: its biases of vx, vy, wz.
 ODOMETRY_BIAS = slice(SLOW, SLOW + 3)
-#: Screws and gyro are compared over so long, s.
-TURN_WINDOW_S = 0.2
+#: Squared deviations between screws and gyro beyond which the screws are trusted less.
+DISAGREEMENT = 4.0
 #: Velocity at the start may be anything a robot does.
 SIGMA_START = np.array([0.01, 0.01, 0.01])
-#: More slip than this is a robot that is stuck: the model ends there.
-MAX_SLIP = 0.9
-#: Rows of a twist (translation first) that the planar filter knows.
-PLANAR = [0, 1, 5]
-
-
-def screw_turn(state: FloatArray, gyro_angle: float, span: float) -> FloatArray:
-    """Angle by which the screws seem to turn the body while the gyro reads `gyro_angle`, rad, shape (1,)."""
-    grip = max(1.0 - state[SLIP_MEAN.stop - 1] - state[SLIP.stop - 1], 1.0 - MAX_SLIP)
-    return np.array([(gyro_angle - state[GYRO_BIAS] * span) / grip])
-
-
-def screw_turn_jacobian(state: FloatArray, gyro_angle: float, span: float) -> FloatArray:
-    """Derivative of `screw_turn` by the state, shape (1, n)."""
-    grip = max(1.0 - state[SLIP_MEAN.stop - 1] - state[SLIP.stop - 1], 1.0 - MAX_SLIP)
-    H = np.zeros((1, len(state)))
-    H[0, GYRO_BIAS] = -span / grip
-    H[0, SLIP_MEAN.stop - 1] = H[0, SLIP.stop - 1] = (gyro_angle - state[GYRO_BIAS] * span) / grip**2
-    return H
 
 
 class RobustOdometry:
@@ -119,19 +101,15 @@ class RobustOdometry:
         self._R_screws = (screw_matrix[:3] @ screw_matrix[:3].T) * settings.sigma_screw_speed**2
         self._speeds = ScrewSpeedAssembly()
         self._imu = ImuBatch()
-        self._tilt = Tilt(settings.tilt_time_constant) if fused else None
-        self._tilt_rotation = self._tilt_at_key = np.eye(3)
-        self._velocity_before = np.zeros(3)
-        self._z = self._z_at_key = self._way = self._way_at_key = 0.0
+        self._space = SpatialPose(settings, tilts=fused)
+        self._comparison = TurnComparison(settings.sigma_still, float(self._R_screws[2, 2]))
+        #: What a disagreement with the gyro makes of the screws' variance.
+        self._distrust = 1.0
         self._stamp_ns: int | None = None
         self._screws: ScrewAngles | None = None
         self._odometry_ns: int | None = None
         self._screws_ns: int | None = None
         self._input, self._Q_input = np.zeros(2), np.zeros((2, 2))
-        self._turn_variance = 0.0
-        self._turn_gyro: float | None = None
-        self._turn_screws = self._turn_span = 0.0
-        self._turn_readings, self._turn_still = 0, True
         self._state: OdometryState | None = None
         self.stale = 0
 
@@ -215,8 +193,8 @@ class RobustOdometry:
             x[VELOCITY].copy(),
             covariance,
             P[VELOCITY, VELOCITY].copy(),
-            None if self._tilt is None else self._pose(pose, self._z, self._tilt_rotation),
-            self._covariance(covariance, self._way),
+            self._space.pose(pose),
+            self._space.covariance(covariance),
         )
         return self._state
 
@@ -230,48 +208,11 @@ class RobustOdometry:
         P_bias = P[b, b].copy()
         by_bias = np.linalg.solve(P_bias + 1e-18 * np.eye(len(P_bias)), P[b, REL]).T
         conditional = P[REL, REL] - by_bias @ P[b, REL]
-        covariance = self._covariance(to_new @ conditional @ to_new.T, self._way - self._way_at_key)
-        jacobian = np.zeros((6, len(P_bias)))
-        jacobian[PLANAR] = to_new @ by_bias
-        level = self._pose(x[REL], self._z - self._z_at_key, self._tilt_rotation)
-        T = level.copy()
-        T[:3] = self._tilt_at_key.T @ level[:3]
-        # From the levelled frame to base_link.
-        turn = np.kron(np.eye(2), self._tilt_rotation.T)
-        covariance, jacobian = turn @ covariance @ turn.T, turn @ jacobian
-        motion = KeyframeMotion(
-            stamp_ns,
-            T,
-            0.5 * (covariance + covariance.T),
-            jacobian,
-            x[b].copy(),
-            x[b].copy(),
-            P_bias,
-        )
+        T, covariance, jacobian = self._space.motion(x[REL], to_new @ conditional @ to_new.T, to_new @ by_bias)
+        motion = KeyframeMotion(stamp_ns, T, covariance, jacobian, x[b].copy(), x[b].copy(), P_bias)
         self._filter.keyframe()
         self._state = None
-        self._tilt_at_key, self._z_at_key, self._way_at_key = self._tilt_rotation, self._z, self._way
         return motion
-
-    def _covariance(self, planar: FloatArray, way: float) -> FloatArray:
-        """Covariance (6, 6) of x, y, z, roll, pitch, yaw from that of x, y, yaw, after a way in m."""
-        settings = self._settings
-        tilt = math.radians(settings.sigma_tilt_deg) ** 2
-        covariance = np.zeros((6, 6))
-        covariance[:2, :2] = planar[:2, :2]
-        covariance[:2, 5], covariance[5, :2], covariance[5, 5] = planar[:2, 2], planar[2, :2], planar[2, 2]
-        covariance[2, 2] = settings.height_walk**2 * (way + 0.01) + (tilt * way * way if self._tilt else 0.0)
-        covariance[3, 3] = covariance[4, 4] = tilt
-        return covariance
-
-    @staticmethod
-    def _pose(planar: FloatArray, z: float, tilt: FloatArray) -> FloatArray:
-        c, s = math.cos(planar[2]), math.sin(planar[2])
-        T = np.eye(4)
-        T[:2, :3] = np.array([[c, -s], [s, c]]) @ tilt[:2]
-        T[2, :3] = tilt[2]
-        T[:3, 3] = planar[0], planar[1], z
-        return T
 
     @property
     def bias(self) -> FloatArray:
@@ -308,51 +249,36 @@ class RobustOdometry:
         self._update_screws(reading.stamp_ns, (reading.angle - previous.angle) / interval)
 
     def _update_screws(self, stamp_ns: int, speed: FloatArray) -> None:
-        before = self._screws_ns
-        self._screws_ns = stamp_ns
+        before, self._screws_ns = self._screws_ns, stamp_ns
+        settings, comparison = self._settings, self._comparison
         screws = self._screw_matrix @ speed
-        still = float(np.abs(speed).max()) < self._settings.still_screw_speed
-        self._use_screws(screws, still)
-        self._predict(stamp_ns)
-        if before is None or self._turn_gyro is None:
-            self._start_turn_window()
+        if math.hypot(screws[0], screws[1]) > settings.fastest:
+            self.stale += 1
             return
-        dt = (stamp_ns - before) * 1e-9
-        self._turn_screws += screws[2] * dt
-        self._turn_readings += 1
-        self._turn_still &= still
-        if self._turn_span >= TURN_WINDOW_S:
-            self._compare_turn()
-            self._start_turn_window()
-
-    def _use_screws(self, screws: FloatArray, still: bool) -> None:
-        """Make a reading of all screws (vx, vy, wz, slip mode) the input from now on."""
-        settings = self._settings
+        still = float(np.abs(speed).max()) < settings.still_screw_speed
         self._input = screws[:2]
-        if still:
-            self._Q_input = np.eye(2) * settings.sigma_still**2
-            return
         doubt = (settings.slip_mode_weight * screws[3]) ** 2
-        self._Q_input = self._R_screws[:2, :2] + np.eye(2) * doubt
-
-    def _compare_turn(self) -> None:
-        ekf, settings = self._filter, self._settings
-        gyro_angle, span = self._turn_gyro, self._turn_span
-        assert gyro_angle is not None
-        noise = self._turn_variance
-        if self._turn_still:
-            H = np.zeros((1, len(ekf.x)))
-            H[0, GYRO_BIAS] = span
-            R = noise + (settings.sigma_still * span) ** 2
-            ekf.correct(np.array([gyro_angle - ekf.x[GYRO_BIAS] * span]), H, np.array([[R]]))
+        moving = self._R_screws[:2, :2] * self._distrust + doubt * np.eye(2)
+        self._Q_input = settings.sigma_still**2 * np.eye(2) if still else moving
+        self._predict(stamp_ns)
+        if before is None:
             return
-        R = noise + self._R_screws[2, 2] * span**2 / self._turn_readings
-        innovation = self._turn_screws - screw_turn(ekf.x, gyro_angle, span)
-        ekf.correct(innovation, screw_turn_jacobian(ekf.x, gyro_angle, span), np.array([[R]]))
+        if not comparison.running:
+            self._turn_by_screws(float(screws[2]), still)
+        elif comparison.add_screws(float(screws[2]) * (stamp_ns - before) * 1e-9, still):
+            distance = self._filter.correct(*comparison.measurement(self._filter.x))
+            self._distrust = max(1.0, distance / DISAGREEMENT)
+            comparison.start(running=True)
 
-    def _start_turn_window(self) -> None:
-        self._turn_gyro, self._turn_screws, self._turn_span = 0.0, 0.0, 0.0
-        self._turn_variance, self._turn_readings, self._turn_still = 0.0, 0, True
+    def _turn_by_screws(self, rate: float, still: bool) -> None:
+        """Without a gyro, the screws are all that says how fast the body turns."""
+        ekf, settings = self._filter, self._settings
+        share = 1.0 - settings.slip_mean
+        H = np.zeros((1, len(ekf.x)))
+        H[0, WZ] = 1.0
+        slip = (settings.sigma_slip**2 + settings.sigma_slip_mean**2) * rate**2
+        R = settings.sigma_still**2 if still else self._R_screws[2, 2] + slip
+        ekf.correct(np.array([share * rate - ekf.x[WZ]]), H, np.array([[R]]))
 
     def _predict(self, stamp_ns: int) -> None:
         previous = self._stamp_ns
@@ -381,32 +307,22 @@ class RobustOdometry:
             q[SLIP] = settings.sigma_slip**2 * (1.0 - kept * kept)
         else:
             q[ODOMETRY_BIAS] = settings.odometry_bias_walk**2 * dt
-        self._way += way
-        ekf.move(Inputs(dt, gyro, screws, self._tilt_rotation[:2, :2]), Q_velocity, q, kept)
-        climb = self._tilt_rotation[2]
-        self._z += float(climb[0] * ekf.x[VX] + climb[1] * ekf.x[VY]) * dt
+        ekf.move(Inputs(dt, gyro, screws, self._space.rotation[:2, :2]), Q_velocity, q, kept)
+        self._space.advance(ekf.x[VELOCITY], dt)
 
     def _turn(self, from_ns: int, until_ns: int, dt: float, Q_velocity: FloatArray) -> float | None:
-        """Take the IMU's samples of an interval: roll and pitch go on; returns the turn rate with its bias, rad/s."""
-        imu, tilt = self._imu, self._tilt
-        assert tilt is not None
+        """Take the IMU's samples of an interval; returns the turn rate with its bias, rad/s."""
+        imu, comparison = self._imu, self._comparison
         samples = max(imu.samples, 1)
         rate = imu.mean_rate(from_ns, until_ns)
-        acceleration = imu.mean_acceleration()
-        if rate is not None or acceleration is not None:
-            x = self._filter.x
-            now = np.array([x[VX], x[VY], 0.0])
-            own = (now - self._velocity_before) / dt + cross(np.array([0.0, 0.0, x[WZ]]), now)
-            self._velocity_before = now
-            tilt.move(dt, rate, acceleration, own, imu.orientation_xyzw)
-            self._tilt_rotation = tilt.rotation()
-        if rate is None:
-            self._turn_gyro = None
+        gyro = self._space.turn(imu, rate, self._filter.x[VELOCITY], dt)
+        if gyro is None:
+            comparison.start(running=False)
             return None
-        Q_velocity[2, 2] = self._settings.sigma_gyro**2 / samples
-        gyro = tilt.turn_rate(rate)
-        if self._turn_gyro is not None:
-            self._turn_gyro += gyro * dt
-            self._turn_span += dt
-            self._turn_variance += Q_velocity[2, 2] * dt * dt
+        variance = self._settings.sigma_gyro**2 / samples
+        Q_velocity[2, 2] = variance
+        if not comparison.running:
+            comparison.start(running=True)
+        else:
+            comparison.add_gyro(gyro * dt, variance * dt * dt, dt)
         return gyro
