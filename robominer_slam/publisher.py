@@ -71,7 +71,9 @@ class Publisher:
                 ODOM,
                 BASE,
                 odom_pose,
-                full_covariance(odometry.covariance),
+                odometry.pose_covariance
+                if odometry.pose_covariance is not None
+                else full_covariance(odometry.covariance),
                 np.array([vx, vy, 0.0, 0.0, 0.0, wz]),
                 full_covariance(odometry.velocity_covariance),
             ),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.measurement import ImuSample, OdometrySample, ScrewAngles
+from drivers.recording_reader import Recording
 from robominer_slam import geometry
 from robominer_slam.configuration.robust_estimation_section import RobustEstimationSection
 from robominer_slam.estimation.planar_motion import (
@@ -29,7 +31,9 @@ from robominer_slam.estimation.planar_motion import (
 from robominer_slam.estimation.robust_odometry import RobustOdometry
 from robominer_slam.estimation.screw_kinematics import forward_matrix
 from robominer_slam.estimation.turn_comparison import screw_turn, screw_turn_jacobian
+from robominer_slam.replay import prepare, replay
 
+RECORDINGS = Path(__file__).parent / "recordings"
 MATRIX = forward_matrix(0.078, math.radians(30.0), 0.15, 0.30)
 STEP_NS = 10_000_000
 states = st.lists(st.floats(-0.5, 0.5), min_size=16, max_size=16).map(np.array)
@@ -229,3 +233,18 @@ def test_a_jump_of_an_encoder_moves_nothing():
         odometry.add(ScrewAngles(i * 20_000_000, angle))
     assert abs(odometry.state_at(2_000_000_000).x) < 0.01
     assert odometry.stale == 1
+
+
+def test_the_pipeline_gives_poses_in_space_from_the_robust_method():
+    inputs = prepare(RECORDINGS / "scenario-2.mcap", None)
+    configuration = inputs.configuration.model_copy(
+        update={"slam": inputs.configuration.slam.model_copy(update={"method": "robust"})}
+    )
+    frames = []
+    replay(replace(inputs, configuration=configuration), frames.append)
+    truths = [truth for _, truth in Recording(RECORDINGS / "scenario-2.mcap").ground_truth()]
+    last = frames[-1]
+    assert last.odometry.T_odom_base is not None
+    np.testing.assert_array_equal(last.T_odom_base, last.odometry.T_odom_base)
+    assert np.hypot(*(last.T_odom_base[:2, 3] - truths[-1].pose[:2])) < 0.3
+    assert last.odometry.pose_covariance.shape == (6, 6)
