@@ -64,6 +64,7 @@ class Publisher:
         pose = geometry.to_vector7(result.T_map_base)
         self._bus.put("pose", pose_messages.pose_with_covariance(stamp, MAP, pose, covariance))
         vx, vy, wz = odometry.velocity
+        in_space = odometry.pose_covariance
         self._bus.put(
             "odom",
             pose_messages.odometry(

@@ -28,7 +28,7 @@ class RobustEstimationSection(Section):
         0.1, "m", "way over which the array's deviation stays the same (1/e)", low=0.005, high=1.0
     )
     drag_spacing: float = parameter(
-        0.02, "m", "way from one measurement to the next: nearer ones say the same", low=0.0, high=0.5
+        0.03, "m", "way from one measurement to the next: nearer ones say the same", low=0.0, high=0.5
     )
     drag_slide: float = parameter(
         2.2, "rad", "turn of a rod per cross slope at start: 1 / friction and more, less what the fit of slopes misses",

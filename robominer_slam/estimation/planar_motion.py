@@ -166,7 +166,8 @@ class PlanarFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has 
         """
         self._inputs, self._fading = inputs, fading
         F, D = motion_jacobian(self.x, inputs)
-        Q = np.diag(q)
+        Q = np.zeros_like(self.P)
+        Q.flat[:: len(q) + 1] = q
         by_velocity = D @ Q_velocity
         Q[REL, REL] += by_velocity @ D.T
         Q[REL, VELOCITY] = by_velocity

@@ -257,9 +257,11 @@ class RobustOdometry:
             return
         still = float(np.abs(speed).max()) < settings.still_screw_speed
         self._input = screws[:2]
-        doubt = (settings.slip_mode_weight * screws[3]) ** 2
-        moving = self._R_screws[:2, :2] * self._distrust + doubt * np.eye(2)
-        self._Q_input = settings.sigma_still**2 * np.eye(2) if still else moving
+        if still:
+            self._Q_input = settings.sigma_still**2 * np.eye(2)
+        else:
+            doubt = (settings.slip_mode_weight * screws[3]) ** 2
+            self._Q_input = self._R_screws[:2, :2] * self._distrust + doubt * np.eye(2)
         self._predict(stamp_ns)
         if before is None:
             return
@@ -293,7 +295,9 @@ class RobustOdometry:
         way = math.hypot(x[VX], x[VY]) * dt
         q[X] = q[Y] = settings.position_walk**2 * way
         walk = settings.acceleration_walk**2 * dt
-        Q_velocity = np.diag([walk, walk, settings.angular_acceleration_walk**2 * dt])
+        Q_velocity = np.zeros((3, 3))
+        Q_velocity[0, 0] = Q_velocity[1, 1] = walk
+        Q_velocity[2, 2] = settings.angular_acceleration_walk**2 * dt
         gyro = screws = None
         kept = 1.0
         if self._source == "fused":
