@@ -254,7 +254,13 @@ class Pipeline:
             sample,
             gyro=None if sample.gyro is None else R @ sample.gyro,
             acceleration=None if sample.acceleration is None else R @ sample.acceleration,
+            orientation_xyzw=None if sample.orientation_xyzw is None else _turned(sample.orientation_xyzw, R),
         )
+
+
+def _turned(xyzw: FloatArray, R_base_imu: FloatArray) -> FloatArray:
+    """Attitude of base_link from that of an IMU mounted in it."""
+    return geometry.matrix_to_quaternion(geometry.quaternion_to_matrix(xyzw) @ R_base_imu.T)
 
 
 def planar_pose(state: OdometryState) -> FloatArray:

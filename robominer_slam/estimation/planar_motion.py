@@ -166,7 +166,8 @@ class PlanarFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has 
         """
         self._inputs, self._fading = inputs, fading
         F, D = motion_jacobian(self.x, inputs)
-        Q = np.diag(q)
+        Q = np.zeros_like(self.P)
+        Q.flat[:: len(q) + 1] = q
         by_velocity = D @ Q_velocity
         Q[REL, REL] += by_velocity @ D.T
         Q[REL, VELOCITY] = by_velocity
@@ -191,7 +192,10 @@ class PlanarFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has 
         """
         PHT = self.P @ H.T
         S = H @ PHT + R
-        distance = float(innovation @ np.linalg.solve(S, innovation))
+        if len(innovation) == 1:
+            distance = float(innovation[0] ** 2 / S[0, 0])
+        else:
+            distance = float(innovation @ np.linalg.solve(S, innovation))
         if distance > self.gate:
             self.outliers += 1
             R = R * (distance / self.gate)
