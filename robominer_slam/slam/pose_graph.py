@@ -18,7 +18,7 @@ from robominer_slam import geometry
 from robominer_slam.geometry import FloatArray
 from robominer_slam.slam import pose_graph_residuals as residuals
 from robominer_slam.slam.growing_array import GrowingArray
-from robominer_slam.slam.pose_graph_covariance import joint_covariance
+from robominer_slam.slam.pose_graph_covariance import joint_covariance, sampled_relative_covariances
 from robominer_slam.slam.pose_graph_input import (
     PoseGraphError,
     check_ends,
@@ -306,6 +306,22 @@ class PoseGraph:
         Ad = geometry.se2_adjoint(T_j_i) if self.dim == 2 else geometry.se3_adjoint(T_j_i)
         A = np.concatenate([-Ad, np.eye(self._d)], axis=1)
         return np.asarray(A @ self.joint_covariance([i, j]) @ A.T)
+
+    def relative_covariances(self, pairs: ArrayLike, samples: int = 100, seed: int = 0) -> FloatArray:
+        """Covariances of X_i^-1 X_j for many pairs (i, j), shape (k, 2), as `relative_covariance`, shape (k, d, d).
+
+        From `samples` random draws of all poses: a variance is off by sqrt(2 / samples) of itself, and the time hardly
+        depends on the number of pairs. The same seed gives the same draws.
+
+        Raises:
+            PoseGraphError: as `optimize`.
+        """
+        enabled, chosen = self._enabled.view, np.asarray(pairs, dtype=np.int64).reshape(-1, 2)
+        edges, kernels, system = self._edge_arrays(enabled), self._kernels(enabled), self._pattern()
+        try:
+            return sampled_relative_covariances(edges, kernels, self._poses.view, system, chosen, samples, seed)
+        except SingularSystemError as error:
+            raise PoseGraphError(f"the edges do not determine all poses ({error})") from error
 
     # ---------------------------------------------------------------------------------------------- internals
 
