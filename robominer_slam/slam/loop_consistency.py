@@ -36,6 +36,9 @@ from robominer_slam.slam import pose_graph_residuals as residuals
 
 IndexArray = NDArray[np.int64]
 
+#: Share of a loop's information that must be left over by the rest of the graph for a direction to be tested.
+_LEAST_REDUNDANCY = 1e-2
+
 
 @dataclass(frozen=True, slots=True)
 class Loops:
@@ -73,6 +76,14 @@ class Innovations:
     squared: FloatArray
     log_det: FloatArray
 
+    def __getitem__(self, which: NDArray[np.int64] | NDArray[np.bool_]) -> Innovations:
+        """Some of the tests."""
+        return Innovations(self.d, self.squared[which], self.log_det[which])
+
+    def with_covariance_times(self, factor: float) -> Innovations:
+        """The same tests with all covariances multiplied."""
+        return Innovations(self.d, self.squared / factor, self.log_det + self.d * np.log(factor))
+
     def evidence(self, log_volume: float) -> FloatArray:
         """log N(e; 0, S) + log V, shape (k,): how much better "true" explains each than "anywhere in V" (nat)."""
         return self.best_evidence(log_volume) - 0.5 * self.squared
@@ -80,6 +91,13 @@ class Innovations:
     def best_evidence(self, log_volume: float) -> FloatArray:
         """The evidence each would have with d2 = 0, shape (k,)."""
         return log_volume - 0.5 * (self.d * np.log(2.0 * np.pi) + self.log_det)
+
+    def chance(self, log_volume: float, gate: float, threshold: float = -np.inf) -> FloatArray:
+        """Probability that a wrong loop, anywhere in V, has d2 < `gate` and evidence above `threshold`; shape (k,)."""
+        r2 = np.clip(2.0 * (self.best_evidence(log_volume) - threshold), 0.0, gate)
+        with np.errstate(divide="ignore"):
+            log_ball = 0.5 * self.d * (np.log(np.pi) + np.log(r2)) - gammaln(0.5 * self.d + 1.0)
+        return np.exp(np.minimum(log_ball + 0.5 * self.log_det - log_volume, 0.0))
 
 
 def innovations(loops: Loops, poses: FloatArray, relative_covariance: FloatArray) -> Innovations:
@@ -91,11 +109,27 @@ def innovations(loops: Loops, poses: FloatArray, relative_covariance: FloatArray
         relative_covariance: P of X_i^-1 X_j as a twist in the frame of j, shape (m, d, d), from a graph without
             these loops (`PoseGraph.relative_covariances`).
     """
-    dim = loops.dim
-    E = _compose(dim, _inverse(dim, loops.Z), residuals.relative_poses(dim, poses, loops.i, loops.j))
-    e = residuals.error_vectors(dim, E, "gtsam")
-    slope = residuals.error_slopes(dim, E, e, "gtsam")
-    return _tested(e, slope @ relative_covariance @ np.swapaxes(slope, -1, -2) + loops.covariance)
+    e, P = _errors(loops, poses, relative_covariance)
+    return _tested(e, P + loops.covariance)
+
+
+def leave_one_out(loops: Loops, poses: FloatArray, relative_covariance: FloatArray) -> FloatArray:
+    """d2 that each accepted loop would have against a graph without it, shape (m,), to first order.
+
+    Args:
+        loops: m loops that are part of the graph.
+        poses: of all nodes, at the optimum, (n, 3) or (n, 4, 4).
+        relative_covariance: P of X_i^-1 X_j, shape (m, d, d), from the graph with these loops. Sigma - P is the
+            covariance of what is left of the error.
+    """
+    e, P = _errors(loops, poses, relative_covariance)
+    root = np.linalg.cholesky(loops.covariance)
+    whitened = np.linalg.solve(root, e[..., None])
+    Q = np.linalg.solve(root, np.swapaxes(np.linalg.solve(root, P), -1, -2))
+    share, axes = np.linalg.eigh(0.5 * (Q + np.swapaxes(Q, -1, -2)))
+    # A direction that the loop alone determines (share 1) has no error to be tested by.
+    remaining = np.maximum(1.0 - share, _LEAST_REDUNDANCY)
+    return np.asarray(((np.swapaxes(axes, -1, -2) @ whitened)[..., 0] ** 2 / remaining).sum(axis=-1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,26 +221,34 @@ def space_log_volume(dim: int, poses: FloatArray) -> float:
     return float(dim * np.log(side) + np.log(2.0 * np.pi if dim == 2 else 8.0 * np.pi**2))
 
 
-def expected_wrong(tests: Innovations, log_volume: float, threshold: float, gate: float) -> float:
-    """How many of the tests would be passed on average if all loops were wrong: evidence > threshold, d2 < gate."""
-    r2 = np.clip(2.0 * (tests.best_evidence(log_volume) - threshold), 0.0, gate)
-    with np.errstate(divide="ignore"):
-        log_ball = 0.5 * tests.d * (np.log(np.pi) + np.log(r2)) - gammaln(0.5 * tests.d + 1.0)
-    return float(np.exp(np.minimum(log_ball + 0.5 * tests.log_det - log_volume, 0.0)).sum())
-
-
 def evidence_threshold(tests: Innovations, log_volume: float, gate: float, wrong: float) -> float:
-    """Least evidence, 0 or more, at which on average at most `wrong` wrong loops pass all the tests together."""
+    """Least evidence, 0 or more, at which `wrong` wrong loops are expected to pass, if all those tested were wrong."""
     low, high = 0.0, max(float(tests.best_evidence(log_volume).max(initial=0.0)), 0.0)
-    if expected_wrong(tests, log_volume, low, gate) <= wrong:
+    if tests.chance(log_volume, gate, low).sum() <= wrong:
         return low
-    for _ in range(40):
+    while high - low > 1e-3:
         middle = 0.5 * (low + high)
-        if expected_wrong(tests, log_volume, middle, gate) <= wrong:
+        if tests.chance(log_volume, gate, middle).sum() <= wrong:
             high = middle
         else:
             low = middle
     return high
+
+
+def convincing(tests: Innovations, log_volume: float, gate: float, wrong: float) -> NDArray[np.bool_]:
+    """Which tests convince, shape (k,): d2 < `gate`, and at most `wrong` wrong loops are to be expected among them.
+
+    A test convinces by its evidence (`evidence_threshold`), or by its strength alone: taken from the strongest on, as
+    many tests as wrong loops would hardly pass need no more than the gate. That keeps true loops of a large but
+    possible error.
+    """
+    passed = tests.squared < gate
+    chance = tests.chance(log_volume, gate)
+    order = np.argsort(chance, kind="stable")
+    strong = np.empty(chance.size, dtype=np.bool_)
+    strong[order] = np.cumsum(chance[order]) <= wrong
+    by_evidence = tests.evidence(log_volume) > evidence_threshold(tests, log_volume, gate, wrong)
+    return passed & (strong | by_evidence)
 
 
 def _forward(loops: Loops) -> Loops:
@@ -220,6 +262,14 @@ def _forward(loops: Loops) -> Loops:
     # Z Exp(e) turned round is Exp(-e) Z^-1 = Z^-1 Exp(-Ad(Z) e).
     covariance[back] = _moved(_adjoint(loops.dim, loops.Z[back]), loops.covariance[back])
     return Loops(loops.dim, np.minimum(loops.i, loops.j), np.maximum(loops.i, loops.j), Z, covariance)
+
+
+def _errors(loops: Loops, poses: FloatArray, relative_covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """e = Log(Z^-1 X_i^-1 X_j), shape (m, d), and the part of its covariance that the poses cause, (m, d, d)."""
+    dim = loops.dim
+    E = _compose(dim, _inverse(dim, loops.Z), residuals.relative_poses(dim, poses, loops.i, loops.j))
+    e = residuals.error_vectors(dim, E, "gtsam")
+    return e, _moved(residuals.error_slopes(dim, E, e, "gtsam"), relative_covariance)
 
 
 def _tested(e: FloatArray, S: FloatArray) -> Innovations:

@@ -14,6 +14,9 @@ from robominer_slam.slam.pose_graph_optimizer import Kernels, edge_costs, normal
 from robominer_slam.slam.pose_graph_residuals import EdgeArrays
 from robominer_slam.slam.pose_graph_system import SystemPattern
 
+#: Pairs whose columns are solved for in one go: bounds the memory.
+_PAIRS_AT_ONCE = 64
+
 
 def joint_covariance(
     edges: EdgeArrays, kernels: Kernels, poses: FloatArray, system: SystemPattern, nodes: Sequence[int]
@@ -62,9 +65,8 @@ def sampled_relative_covariances(
         SingularSystemError: the edges leave a direction free.
     """
     d, f = system.block_size, system.free_nodes.size
-    out = np.zeros((pairs.shape[0], d, d))
     if f == 0 or pairs.shape[0] == 0:
-        return out
+        return np.zeros((pairs.shape[0], d, d))
     pivot = residuals.positions(edges.dim, poses).mean(axis=0)
     costs = edge_costs(edges, kernels, poses, "gtsam")
     to_node = residuals.world_to_node(edges.dim, poses, pivot)
@@ -80,5 +82,37 @@ def sampled_relative_covariances(
     drawn[system.free_nodes] = factors.solve(right_side).reshape(f, d, samples)
     i, j = pairs.T
     relative = to_node[j] @ (drawn[j] - drawn[i])
-    out[...] = relative @ np.swapaxes(relative, -1, -2) / samples
+    return np.asarray(relative @ np.swapaxes(relative, -1, -2) / samples)
+
+
+def relative_covariances(
+    edges: EdgeArrays, kernels: Kernels, poses: FloatArray, system: SystemPattern, pairs: NDArray[np.int64]
+) -> FloatArray:
+    """Covariances of X_i^-1 X_j, exact, shape (k, d, d), as twists in the frame of j: d columns are solved per pair.
+
+    Raises:
+        SingularSystemError: the edges leave a direction free.
+    """
+    d, f = system.block_size, system.free_nodes.size
+    out = np.zeros((pairs.shape[0], d, d))
+    if f == 0 or pairs.shape[0] == 0:
+        return out
+    pivot = residuals.positions(edges.dim, poses).mean(axis=0)
+    costs = edge_costs(edges, kernels, poses, "gtsam")
+    _, blocks = normal_equations(edges, costs, poses, pivot, system, "gtsam")
+    factors = system.factorise(blocks)
+    to_node = residuals.world_to_node(edges.dim, poses, pivot)
+    place = np.full(poses.shape[0], f)
+    place[system.free_nodes] = np.arange(f)
+    for first in range(0, pairs.shape[0], _PAIRS_AT_ONCE):
+        i, j = pairs[first : first + _PAIRS_AT_ONCE].T
+        k = np.arange(i.size)
+        selected = np.zeros((f + 1, d, i.size, d))  # the last row is that of the fixed nodes
+        at_j = np.swapaxes(to_node[j], -1, -2)
+        selected[place[j], :, k] += at_j
+        selected[place[i], :, k] -= at_j
+        columns = selected[:f].reshape(f * d, i.size * d)
+        solved = factors.solve(columns).reshape(f * d, i.size, d)
+        P = np.einsum("aku,akv->kuv", columns.reshape(f * d, i.size, d), solved)
+        out[first : first + i.size] = 0.5 * (P + np.swapaxes(P, -1, -2))
     return out
