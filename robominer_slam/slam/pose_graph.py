@@ -140,6 +140,11 @@ class PoseGraph:
         """Omega of all edges, shape (m, d, d)."""
         return np.array(self._information.view)
 
+    @property
+    def fixed_nodes(self) -> tuple[int, ...]:
+        """Nodes that do not move, ascending."""
+        return tuple(sorted(self._fixed))
+
     def add_node(self, pose: ArrayLike) -> int:
         """Add one node with a first guess of its pose, (3,) or (4, 4); returns its number, counted from 0."""
         return int(self.add_nodes(np.asarray(pose, dtype=np.float64)[None])[0])
