@@ -7,7 +7,7 @@ the rest of the graph by `leave_one_out`. Loops against each other are in `loop_
 
 Passing such a test is worth something only if a wrong loop would have failed it. A wrong loop may lie anywhere in the
 space of relative poses, of volume V (`space_log_volume`), so the evidence for a loop is the log of the ratio of
-the two densities, log N(e; 0, S) + log V. The share of wrong loops that reach a given evidence is the volume of an
+the two densities, log p(e; S) + log V, p being Student's t. The share of wrong loops that reach a given evidence is the volume of an
 ellipsoid over V; `evidence_threshold` sets the level so that, over all loops tested, fewer than a given number of
 wrong ones are to be expected. Tests too weak to tell (drift as large as the space) thus decide nothing.
 
@@ -23,6 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
+from scipy.stats import f as f_distribution
 
 from robominer_slam.geometry import FloatArray, squared_norm
 from robominer_slam.slam import pose_graph_residuals as residuals
@@ -30,6 +31,8 @@ from robominer_slam.slam.pose_algebra import compose, inverse, moved
 
 IndexArray = NDArray[np.int64]
 
+#: Degrees of freedom of Student's t, the density of errors: real errors have heavier tails than a normal density.
+_NU = 3.0
 #: Share of a loop's information that must be left over by the rest of the graph for a direction to be tested.
 _LEAST_REDUNDANCY = 1e-2
 
@@ -79,16 +82,18 @@ class Innovations:
         return Innovations(self.d, self.squared / factor, self.log_det + self.d * np.log(factor))
 
     def evidence(self, log_volume: float) -> FloatArray:
-        """How much better "true" explains each than "anywhere in V": log N(e; 0, S) + log V, nat, shape (k,)."""
-        return self.best_evidence(log_volume) - 0.5 * self.squared
+        """How much better "true" explains each than "anywhere in V": log p(e; S) + log V, nat, shape (k,)."""
+        return self.best_evidence(log_volume) - 0.5 * (_NU + self.d) * np.log1p(self.squared / _NU)
 
     def best_evidence(self, log_volume: float) -> FloatArray:
         """The evidence each would have with d2 = 0, shape (k,)."""
-        return log_volume - 0.5 * (self.d * np.log(2.0 * np.pi) + self.log_det)
+        peak = gammaln(0.5 * (_NU + self.d)) - gammaln(0.5 * _NU) - 0.5 * self.d * np.log(_NU * np.pi)
+        return np.asarray(log_volume + peak - 0.5 * self.log_det, dtype=np.float64)
 
     def chance(self, log_volume: float, gate: float, threshold: float = -np.inf) -> FloatArray:
         """Probability that a wrong loop, anywhere in V, has d2 < `gate` and evidence above `threshold`; shape (k,)."""
-        r2 = np.clip(2.0 * (self.best_evidence(log_volume) - threshold), 0.0, gate)
+        exponent = np.minimum(2.0 / (_NU + self.d) * (self.best_evidence(log_volume) - threshold), 700.0)
+        r2 = np.clip(_NU * np.expm1(exponent), 0.0, gate)
         with np.errstate(divide="ignore"):
             log_ball = 0.5 * self.d * (np.log(np.pi) + np.log(r2)) - gammaln(0.5 * self.d + 1.0)
         return np.asarray(np.exp(np.minimum(log_ball + 0.5 * self.log_det - log_volume, 0.0)), dtype=np.float64)
@@ -124,6 +129,11 @@ def leave_one_out(loops: Loops, poses: FloatArray, relative_covariance: FloatArr
     # A direction that the loop alone determines (share 1) has no error to be tested by.
     remaining = np.maximum(1.0 - share, _LEAST_REDUNDANCY)
     return np.asarray(((np.swapaxes(axes, -1, -2) @ whitened)[..., 0] ** 2 / remaining).sum(axis=-1))
+
+
+def typical_squared(d: int) -> float:
+    """Median of d2 if the covariances are right."""
+    return d * float(f_distribution.median(d, _NU))
 
 
 def space_log_volume(dim: int, poses: FloatArray) -> float:

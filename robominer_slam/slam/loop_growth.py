@@ -13,8 +13,9 @@ disagree with the rest are taken back, the worst first. Each loop that is accept
 stronger. Only the last step decides loops that nothing else will ever touch.
 
 Stated covariances are often far too large (the residuals of the public set M3500 are a sixth of its sigmas). The
-noise is therefore measured on the accepted loops, at the upper end of their errors, and never taken as larger than
-stated. The same factor applies to odometry, whose drift the same errors contain.
+noise is therefore measured on the accepted loops, and never taken as larger than stated: its median for the evidence,
+its upper end for the gate, so that a few loops worse than the rest stay. The same factors apply to odometry, whose
+drift the same errors contain.
 """
 
 from __future__ import annotations
@@ -33,12 +34,13 @@ from robominer_slam.slam.loop_consistency import (
     leave_one_out,
     space_log_volume,
     surely_placed,
+    typical_squared,
 )
 from robominer_slam.slam.loop_pairs import clusters
 from robominer_slam.slam.pose_graph import OptimizationOptions, PoseGraph
 
 #: Expected number of wrong loops allowed, as shares of the chosen one: tried in turn.
-_LADDER = (0.02, 0.2, 1.0)
+_LADDER = (0.02, 1.0)
 #: As many times more for loops whose place the graph knows: they can hardly bend it.
 _FOR_SURELY_PLACED = 10.0
 #: Random draws of the poses per step; variances are good to sqrt(2 / 64) = 18 %. What decides is tested exactly.
@@ -59,7 +61,7 @@ class LoopGrowth:
     Attributes:
         graph: odometry and loops; the accepted loops are enabled, the poses are the optimum with them.
         accepted: which loops, shape (m,).
-        noise: factor on all covariances, in (0, 1].
+        typical, noise: factors on all covariances, in (0, 1], from the median and the upper end of the errors.
         iterations, rounds: linear systems solved, steps taken.
     """
 
@@ -78,7 +80,7 @@ class LoopGrowth:
         """
         self.graph, self.loops = graph, loops
         self.accepted: BoolArray = np.zeros(loop_edges.size, dtype=np.bool_)
-        self.noise = 1.0
+        self.typical = self.noise = 1.0
         self.iterations = self.rounds = 0
         self._edges, self._agreeing, self._wrong, self._gate = loop_edges, agreeing, wrong, gate
         self._ends = np.stack([loops.i, loops.j], axis=-1)
@@ -92,13 +94,14 @@ class LoopGrowth:
         """Grow from odometry, or from the loops `first`, shape (m,), until no loop is left that convinces."""
         self.graph.poses = self._start
         self.accepted = np.zeros_like(self.accepted) if first is None else first.copy()
-        self._strikes[:], self._predicted[:], self.noise = 0, np.nan, 1.0
+        self._strikes[:], self._predicted[:] = 0, np.nan
+        self.typical = self.noise = 1.0
         self._settle()
         level = 0
         for _ in range(_ROUNDS):
             candidates = np.flatnonzero(~self.accepted & (self._strikes < _STRIKES))
             tests = innovations(self.loops[candidates], self.graph.poses, self._P[candidates])
-            new = self._convincing(tests.with_covariance_times(self.noise), candidates, _LADDER[level] * self._wrong)
+            new = self._convincing(tests, candidates, _LADDER[level] * self._wrong)
             if not new.any():
                 new = self._largest_cluster(candidates[tests.squared < self._gate * self.noise], candidates)
             if not new.any():
@@ -120,9 +123,10 @@ class LoopGrowth:
         return [label == k for k in np.argsort(-sizes, kind="stable") if sizes[k] >= 2]
 
     def _convincing(self, tests: Innovations, candidates: IndexArray, wrong: float) -> BoolArray:
+        typical, upper = tests.with_covariance_times(self.typical), tests.with_covariance_times(self.noise)
         own = self._own_log_det[candidates] + tests.d * np.log(self.noise)
-        placed = surely_placed(tests, own, self._log_volume, self._gate, _FOR_SURELY_PLACED * wrong)
-        return placed | convincing(tests, self._log_volume, self._gate, wrong)
+        placed = surely_placed(upper, own, self._log_volume, self._gate, _FOR_SURELY_PLACED * wrong)
+        return placed | convincing(typical, self._log_volume, self._gate * self.noise / self.typical, wrong)
 
     def _largest_cluster(self, passing: IndexArray, candidates: IndexArray) -> BoolArray:
         label = self._clusters(passing)
@@ -144,7 +148,7 @@ class LoopGrowth:
         while self.accepted.any():
             inside = np.flatnonzero(self.accepted)
             d2 = leave_one_out(self.loops[inside], self.graph.poses, self._P[inside])
-            self.noise = self._measured_noise(d2)
+            self._measure_noise(d2)
             gate = self._gate * self.noise
             doubtful = inside[d2 > 0.5 * gate]
             if not doubtful.size:
@@ -164,11 +168,14 @@ class LoopGrowth:
         self.iterations += self.graph.optimize(_GROWING).iterations
         self._P: FloatArray = self.graph.relative_covariances(self._ends, _DRAWS, seed=self.rounds)
 
-    def _measured_noise(self, left_out: FloatArray) -> float:
+    def _measure_noise(self, left_out: FloatArray) -> None:
+        """Compare the errors with those stated, as they were predicted and as they are, whichever are larger."""
         predicted = self._predicted[self.accepted]
         predicted = predicted[np.isfinite(predicted)]
-        if predicted.size < _LEAST_LOOPS:
-            return 1.0
-        upper = max(np.quantile(predicted, _UPPER_END), np.quantile(left_out, _UPPER_END))
-        d = 3 if self.graph.dim == 2 else 6
-        return float(np.clip(upper / chi2_distribution.ppf(_UPPER_END, d), np.finfo(float).eps, 1.0))
+        self.typical = self.noise = 1.0
+        if predicted.size >= _LEAST_LOOPS:
+            d = 3 if self.graph.dim == 2 else 6
+            typical = max(np.median(predicted), np.median(left_out)) / typical_squared(d)
+            upper = max(np.quantile(predicted, _UPPER_END), np.quantile(left_out, _UPPER_END))
+            self.typical = float(np.clip(typical, np.finfo(float).eps, 1.0))
+            self.noise = float(np.clip(upper / chi2_distribution.ppf(_UPPER_END, d), self.typical, 1.0))

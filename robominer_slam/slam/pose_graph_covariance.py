@@ -75,7 +75,7 @@ def sampled_relative_covariances(
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     # Random signs have the covariance of standard normal noise, and cost less.
     noise = np.random.default_rng(seed).integers(0, 2, size=(edges.i.size, d, samples), dtype=np.int8) * 2.0 - 1.0
-    pushes = np.swapaxes(J, -1, -2) @ (root @ noise)
+    pushes = (np.swapaxes(J, -1, -2) @ root) @ noise
     right_side = system.gradient(pushes.reshape(edges.i.size, d * samples)).reshape(f * d, samples)
     factors = system.factorise(system.hessian_blocks(np.swapaxes(J, -1, -2) @ information @ J))
     drawn = np.zeros((poses.shape[0], d, samples))
