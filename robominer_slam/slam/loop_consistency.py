@@ -6,10 +6,10 @@ freedom if the loop is true. A new loop is tested against the accepted ones with
 the rest of the graph by `leave_one_out`. Loops against each other are in `loop_pairs`.
 
 Passing such a test is worth something only if a wrong loop would have failed it. A wrong loop may lie anywhere in the
-space of relative poses, of volume V (`space_log_volume`), so the evidence for a loop is the log of the ratio of
-the two densities, log p(e; S) + log V, p being Student's t. The share of wrong loops that reach a given evidence is the volume of an
-ellipsoid over V; `evidence_threshold` sets the level so that, over all loops tested, fewer than a given number of
-wrong ones are to be expected. Tests too weak to tell (drift as large as the space) thus decide nothing.
+space of relative poses, of volume V (`space_log_volume`), so the evidence for a loop is the log of the ratio of the
+two densities, log p(e; S) + log V, with p Student's t. The share of wrong loops that reach a given evidence is the
+volume of an ellipsoid over V; `evidence_threshold` sets the level so that, over all loops tested, fewer than a given
+number of wrong ones are to be expected. Tests too weak to tell (drift as large as the space) thus decide nothing.
 
 Sources: gates and the ratio of densities: Bar-Shalom and Fortmann, "Tracking and data association" (1988); chi2
 tests of loops against the optimised graph: Latif, Cadena and Neira, "Robust loop closing over time for pose graph

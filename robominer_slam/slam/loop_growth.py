@@ -40,7 +40,7 @@ from robominer_slam.slam.loop_pairs import clusters
 from robominer_slam.slam.pose_graph import OptimizationOptions, PoseGraph
 
 #: Expected number of wrong loops allowed, as shares of the chosen one: tried in turn.
-_LADDER = (0.02, 1.0)
+_LADDER = (0.05, 1.0)
 #: As many times more for loops whose place the graph knows: they can hardly bend it.
 _FOR_SURELY_PLACED = 10.0
 #: Random draws of the poses per step; variances are good to sqrt(2 / 64) = 18 %. What decides is tested exactly.
