@@ -161,10 +161,15 @@ def evidence_threshold(tests: Innovations, log_volume: float, gate: float, wrong
     return high
 
 
-def convincing(tests: Innovations, log_volume: float, gate: float, wrong: float) -> NDArray[np.bool_]:
-    """Which loops convince by evidence, shape (k,): d2 < `gate`, and so good that `wrong` wrong ones at most pass."""
-    threshold = evidence_threshold(tests, log_volume, gate, wrong)
-    return (tests.squared < gate) & (tests.evidence(log_volume) > threshold)
+def convincing(
+    tests: Innovations, log_volume: float, gate: float, wrong: float, least: float = 0.0
+) -> NDArray[np.bool_]:
+    """Which loops convince by evidence, shape (k,): d2 < `gate`, and so good that `wrong` wrong ones at most pass.
+
+    `least` is the least evidence asked for, whatever is to be expected.
+    """
+    threshold = max(evidence_threshold(tests, log_volume, gate, wrong), least)
+    return np.asarray((tests.squared < gate) & (tests.evidence(log_volume) > threshold))
 
 
 def surely_placed(

@@ -40,9 +40,11 @@ from robominer_slam.slam.loop_pairs import clusters
 from robominer_slam.slam.pose_graph import OptimizationOptions, PoseGraph
 
 #: Expected number of wrong loops allowed, as shares of the chosen one: tried in turn.
-_LADDER = (0.05, 1.0)
+_LADDER = (0.025, 1.0)
 #: As many times more for loops whose place the graph knows: they can hardly bend it.
-_FOR_SURELY_PLACED = 10.0
+_FOR_SURELY_PLACED = 5.0
+#: Odds for a loop, if one true loop were among all that are left: above e^0.4 = 1.5.
+_LEAST_LOG_ODDS = 0.4
 #: Random draws of the poses per step; variances are good to sqrt(2 / 64) = 18 %. What decides is tested exactly.
 _DRAWS = 64
 #: A loop that was taken back so often stays out.
@@ -100,7 +102,7 @@ class LoopGrowth:
         level = 0
         for _ in range(_ROUNDS):
             candidates = np.flatnonzero(~self.accepted & (self._strikes < _STRIKES))
-            tests = innovations(self.loops[candidates], self.graph.poses, self._P[candidates])
+            tests = self._tests(candidates, exact=level == len(_LADDER) - 1)
             new = self._convincing(tests, candidates, _LADDER[level] * self._wrong)
             if not new.any():
                 new = self._largest_cluster(candidates[tests.squared < self._gate * self.noise], candidates)
@@ -115,6 +117,15 @@ class LoopGrowth:
             self.accepted[candidates[new]] = True
             self._settle()
 
+    def _tests(self, candidates: IndexArray, exact: bool) -> Innovations:
+        P = self._P[candidates]
+        tests = innovations(self.loops[candidates], self.graph.poses, P)
+        if exact:
+            near = np.flatnonzero(tests.squared < 2.0 * self._gate * self.noise)
+            P[near] = self.graph.relative_covariances(self._ends[candidates[near]])
+            tests = innovations(self.loops[candidates], self.graph.poses, P)
+        return tests
+
     def supported_but_rejected(self) -> list[BoolArray]:
         """Clusters of rejected loops that agree with each other, largest first; each a mask of shape (m,)."""
         out = np.flatnonzero(~self.accepted)
@@ -126,7 +137,9 @@ class LoopGrowth:
         typical, upper = tests.with_covariance_times(self.typical), tests.with_covariance_times(self.noise)
         own = self._own_log_det[candidates] + tests.d * np.log(self.noise)
         placed = surely_placed(upper, own, self._log_volume, self._gate, _FOR_SURELY_PLACED * wrong)
-        return placed | convincing(typical, self._log_volume, self._gate * self.noise / self.typical, wrong)
+        # One true loop among so many is the least to start from; the odds then have to speak for it.
+        least = np.log(max(candidates.size, 1)) + _LEAST_LOG_ODDS
+        return placed | convincing(typical, self._log_volume, self._gate * self.noise / self.typical, wrong, least)
 
     def _largest_cluster(self, passing: IndexArray, candidates: IndexArray) -> BoolArray:
         label = self._clusters(passing)

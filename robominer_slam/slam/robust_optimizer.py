@@ -71,7 +71,7 @@ def optimize_robustly(
     graph: PoseGraph,
     options: OptimizationOptions | None = None,
     sequence: ArrayLike | None = None,
-    wrong_loops: float = 0.05,
+    wrong_loops: float = 0.1,
 ) -> RobustResult:
     """Optimise a graph with odometry that holds and loops that may be wrong; disable the wrong ones.
 
