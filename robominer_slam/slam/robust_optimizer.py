@@ -39,6 +39,8 @@ from robominer_slam.slam.pose_graph_residuals import Convention
 _WINDOW = 20
 #: How often rejected loops that agree among themselves may challenge the accepted ones.
 _CHALLENGES = 3
+#: A challenger may have as many times the noise at most.
+_AS_QUIET = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,11 +173,14 @@ def _grown(
 
 
 def _challenge(growth: LoopGrowth) -> None:
-    """Grow again from rejected loops that agree among themselves; keep the set with the most loops."""
+    """Grow again from rejected loops that agree among themselves; keep the set with the most loops.
+
+    A set that is larger only because it takes the noise for larger does not count.
+    """
     for challenger in growth.supported_but_rejected()[:_CHALLENGES]:
         kept, poses, noise = growth.accepted, growth.graph.poses, growth.noise
         growth.grow(challenger)
-        if growth.accepted.sum() <= kept.sum():
+        if growth.accepted.sum() <= kept.sum() or growth.noise > _AS_QUIET * noise:
             growth.accepted, growth.graph.poses, growth.noise = kept, poses, noise
 
 
