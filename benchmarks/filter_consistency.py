@@ -26,6 +26,8 @@ FloatArray = NDArray[np.float64]
 MATRIX = forward_matrix(0.078, math.radians(30.0), 0.15, 0.30)
 STEP_S, STEP_NS = 0.02, 20_000_000
 KEYFRAME_EVERY = 50
+#: A standing robot's creep in turning changes with the windows in which screws and gyro are compared.
+CREEP_EVERY = 10
 #: Time in which the walking velocity is pulled back to zero, s: slowly against the 0.1 s that the filter averages over.
 PULL_S = 3.0
 
@@ -40,13 +42,16 @@ def fused_run(rng: np.random.Generator, seconds: float, settings: RobustEstimati
     pose, angle, nees = np.zeros(3), np.zeros(4), []
     Q = MATRIX[:3] @ MATRIX[:3].T * settings.sigma_screw_speed**2
     root = np.linalg.cholesky(Q)
+    creep = 0.0
     phase = rng.uniform(0.0, 2.0 * math.pi, 2)
     odometry.add(ImuSample(0, np.array([0.0, 0.0, bias]), None))
     odometry.add(ScrewAngles(0, angle))
     for k in range(1, round(seconds / STEP_S) + 1):
         stamp = k * STEP_NS
         driving = k > 100
-        turn = 0.3 * math.sin(0.3 * k * STEP_S + phase[0]) * driving
+        if k % CREEP_EVERY == 1:
+            creep = rng.normal(0.0, settings.sigma_still)
+        turn = 0.3 * math.sin(0.3 * k * STEP_S + phase[0]) if driving else creep
         screws = np.array([0.18, 0.03 * math.sin(0.2 * k * STEP_S + phase[1])]) * driving
         noise = root @ rng.normal(size=3)
         grip = 1.0 - slip_mean - slip

@@ -72,9 +72,7 @@ class Publisher:
                 ODOM,
                 BASE,
                 odom_pose,
-                odometry.pose_covariance
-                if odometry.pose_covariance is not None
-                else full_covariance(odometry.covariance),
+                full_covariance(odometry.covariance) if in_space is None else in_space,
                 np.array([vx, vy, 0.0, 0.0, 0.0, wz]),
                 full_covariance(odometry.velocity_covariance),
             ),

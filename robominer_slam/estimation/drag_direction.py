@@ -165,8 +165,8 @@ class DragDirection:
         speed = math.hypot(at[0], at[1])
         if new_way or speed < settings.drag_least_speed:
             return None
-        self._learn_slide(found, covariance, min(1.0, way / (2.0 * settings.drag_length)))
         discount = min(1.0, way / (2.0 * settings.drag_length))
+        self._learn_slide(found, covariance, discount)
         shared = np.linalg.inv(np.eye(3) + found.information @ self._common(velocity)) * discount
         information = shared @ found.information
         return DragInformation(0.5 * (information + information.T), shared @ found.vector, found.tips, at[:2] / speed)

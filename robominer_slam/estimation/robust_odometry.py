@@ -41,6 +41,7 @@ from robominer_slam.estimation.planar_motion import (
     Y,
     compose,
     compose_jacobian,
+    motion_ahead,
 )
 from robominer_slam.estimation.screw_speeds import ScrewSpeedAssembly
 from robominer_slam.estimation.spatial_pose import SpatialPose
@@ -152,30 +153,10 @@ class RobustOdometry:
             return
         self._state = None
         rows, innovation = found.compressed()
-        H = np.zeros((len(rows), len(self._filter.x)))
+        H = np.zeros((len(rows), len(ekf.x)))
         H[:, VELOCITY] = rows
-        ekf.correct(innovation, H, np.eye(len(rows)), self._along_motion(found.ahead))
-
-    def _along_motion(self, ahead: FloatArray) -> FloatArray:
-        """Combinations of states that are motion `ahead`, shape (k, n): the drag's angle must not move them.
-
-        Its derivative by them is zero but for noise in the direction, which repeated updates would take for
-        knowledge of the speed.
-        """
-        x = self._filter.x
-        c, s = math.cos(x[YAW]), math.sin(x[YAW])
-        if self._source == "odometry":
-            held = np.zeros((3, len(x)))
-            held[2, SLOW : SLOW + 2] = ahead
-        else:
-            held = np.zeros((4, len(x)))
-            by_slip = ahead * self._input
-            by_slip = by_slip / max(math.hypot(by_slip[0], by_slip[1]), 1e-9)
-            held[2, SLIP_MEAN.start : SLIP_MEAN.start + 2] = by_slip
-            held[3, SLIP.start : SLIP.start + 2] = by_slip
-        held[0, VX:WZ] = ahead
-        held[1, X:YAW] = c * ahead[0] - s * ahead[1], s * ahead[0] + c * ahead[1]
-        return held
+        screws = self._input if self._source == "fused" else None
+        ekf.correct(innovation, H, np.eye(len(rows)), motion_ahead(ekf.x, found.ahead, screws))
 
     def measures_motion(self, measurement: Measurement) -> bool:
         """Screws do if all four are heard of, or the ready-made odometry; a gyro alone does not."""
