@@ -90,7 +90,7 @@ class RobustEstimationSection(Section):
     )
     sigma_still: float = parameter(0.002, "m/s, rad/s", "creep of a robot whose screws stand", low=1e-5, high=0.1)
     sigma_match: float = parameter(
-        0.0001, "m", "what scan matches have in common: whiskers err by 1.2 mm each, rows of eight by a third, and so on",
+        0.0001, "m", "what scan matches have in common: whiskers' errors of 1.2 mm each, averaged",
         low=0.0, high=0.1,
     )  # fmt: skip
     sigma_match_yaw_deg: float = parameter(
