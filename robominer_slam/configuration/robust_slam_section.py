@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from robominer_slam.configuration.parameter import Section, parameter
+from robominer_slam.configuration.relocalisation_section import RelocalisationSection
 
 
 class SurfaceSection(Section):
@@ -67,9 +68,7 @@ class ClosureSection(Section):
     min_contrast: float = parameter(
         1.5, "1", "the ground's relief over what is left of it: flat ground fits everywhere", low=0.0, high=100.0
     )
-    uniqueness: float = parameter(
-        1.3, "1", "cost of the next best place over that of the best", low=1.0, high=100.0
-    )
+    uniqueness: float = parameter(1.3, "1", "cost of the next best place over that of the best", low=1.0, high=100.0)
     max_sigma: float = parameter(0.03, "m", "a match that leaves a direction free is none", low=0.001, high=1.0)
     max_sigma_yaw_deg: float = parameter(2.0, "deg", "as max_sigma", low=0.1, high=45.0)
     inflation: float = parameter(
@@ -97,3 +96,4 @@ class RobustSlamSection(Section):
     surface: SurfaceSection = Field(default_factory=SurfaceSection)
     scan_matching: ScanMatchingSection = Field(default_factory=ScanMatchingSection)
     closure: ClosureSection = Field(default_factory=ClosureSection)
+    relocalisation: RelocalisationSection = Field(default_factory=RelocalisationSection)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robominer_slam.estimation.keyframe_motion import KeyframeMotion
+from robominer_slam.slam.place_prior import PlacePrior
 
 FloatArray = NDArray[np.float64]
 
@@ -25,6 +26,8 @@ class Keyframe:
         points: contact points in base_link at that time, shape (m, 3), m.
         travelled: distance driven by odometry up to here, m.
         motion: since the keyframe before, where the dead reckoning tells its noise and biases apart.
+        breaks: how often so far the ground has ceased to be the one touched just before: carried, or fallen.
+        prior: where the operator says that this keyframe is; the way from the keyframe before is then not known.
     """
 
     id: int
@@ -33,6 +36,8 @@ class Keyframe:
     points: FloatArray
     travelled: float
     motion: KeyframeMotion | None = None
+    breaks: int = 0
+    prior: PlacePrior | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +71,10 @@ class BackendResult:
         edges: of the whole graph.
         closures: loop closures added by this keyframe.
         version: grows by one with each result.
+        entered: keyframes that are new in the map; None for just `keyframe`. While the place in the map is not
+            known there are none, and all that were made meanwhile enter together when it is.
+        ids: of the keyframes that `poses` are of; None for 0, 1, 2, ...
+        localised: whether the keyframe's place in the map is known.
     """
 
     keyframe: Keyframe
@@ -75,6 +84,19 @@ class BackendResult:
     edges: Sequence[GraphEdge]
     closures: int
     version: int
+    entered: tuple[Keyframe, ...] | None = None
+    ids: tuple[int, ...] | None = None
+    localised: bool = True
+
+    @property
+    def new_keyframes(self) -> tuple[Keyframe, ...]:
+        """Keyframes that this result adds to the map."""
+        return (self.keyframe,) if self.entered is None else self.entered
+
+    @property
+    def keyframe_ids(self) -> tuple[int, ...]:
+        """Ids of the keyframes that `poses` are of."""
+        return tuple(range(len(self.poses))) if self.ids is None else self.ids
 
 
 class Backend(Protocol):

@@ -24,6 +24,9 @@ FloatArray = NDArray[np.float64]
 LEAST_CONTACTS = 8
 #: Turning by 1 rad moves the whiskers by about this, m: travel counts both.
 TURN_ARM = 0.15
+#: So many matches in a row that do not fit, each over ground known to this share, are a break.
+BREAK_MISFITS = 6
+BREAK_OVERLAP = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +50,7 @@ class ScanOdometry:
     Attributes:
         matches: made so far.
         travelled: way of the array, m.
+        breaks: how often the ground ceased to be the one touched just before; the local map begins anew then.
     """
 
     def __init__(self, parameters: ScanMatchingSection, model: SurfaceModel, reach: float) -> None:
@@ -66,6 +70,8 @@ class ScanOdometry:
         self._before: FloatArray | None = None
         self.matches = 0
         self.travelled = 0.0
+        self.breaks = 0
+        self._misfits = 0
 
     def match(self, pose: FloatArray, covariance: FloatArray, points: FloatArray) -> ScanCorrection | None:
         """Match a frame, if the robot has moved far enough since the last.
@@ -83,8 +89,12 @@ class ScanOdometry:
             return None
         prior = np.linalg.inv(covariance + np.eye(4) * 1e-12)
         found = fit(self._map.surface, points, pose, prior, associations=self._parameters.associations)
-        if found.overlap * len(points) < LEAST_CONTACTS or found.inliers < self._parameters.least_inliers:
+        if found.overlap * len(points) < LEAST_CONTACTS:
             return None
+        if found.inliers < self._parameters.least_inliers:
+            self._misfit(found.overlap)
+            return None
+        self._misfits = 0
         self.matches += 1
         offset = found.pose - pose
         offset[YAW] = wrap_angle(offset[YAW])
@@ -103,6 +113,20 @@ class ScanOdometry:
         self._last = pose.copy()
         if len(points):
             self._map.add(self.travelled, placed(points, pose))
+
+    def clear(self) -> None:
+        """Forget the ground touched lately: the robot has been carried."""
+        self._map.clear()
+        self._last = self._before = None
+        self._misfits = 0
+
+    def _misfit(self, overlap: float) -> None:
+        if overlap < BREAK_OVERLAP:
+            return
+        self._misfits += 1
+        if self._misfits >= BREAK_MISFITS:
+            self.breaks += 1
+            self.clear()
 
     def _travel(self, pose: FloatArray) -> None:
         if self._before is not None:
