@@ -10,11 +10,32 @@ class RobustEstimationSection(Section):
 
     drag: bool = parameter(True, "", "use the direction in which whiskers trail as a measurement of motion")
     drag_sigma_deg: float = parameter(
-        4.0, "deg", "deviation of one tip's direction from its motion, flat ground to rubble", low=0.5, high=45.0
+        7.0, "deg", "deviation of one tip's direction: 5 deg on even ground, 10 on rubble", low=0.5, high=45.0
+    )
+    drag_common_deg: float = parameter(
+        1.5, "deg", "deviation of the array's direction as a whole on straight drives", low=0.0, high=45.0
+    )
+    drag_common_curvature: float = parameter(
+        0.1, "rad/m", "as drag_common_deg, of the turn that the array's directions show", low=0.0, high=10.0
+    )
+    drag_turn_share: float = parameter(
+        0.15, "1", "of a turn, the directions may miss: joints that are stiffer across than along", low=0.0, high=1.0
+    )
+    drag_turn_length: float = parameter(
+        5.0, "m", "way over which that stays the same: a loop around one slope", low=0.0, high=100.0
     )
     drag_length: float = parameter(
-        0.05, "m", "distance over which the deviation of one tip stays the same", low=0.005, high=1.0
+        0.1, "m", "way over which the array's deviation stays the same (1/e)", low=0.005, high=1.0
     )
+    drag_spacing: float = parameter(
+        0.02, "m", "way from one measurement to the next: nearer ones say the same", low=0.0, high=0.5
+    )
+    drag_slide: float = parameter(
+        2.2, "rad", "turn of a rod per cross slope at start: 1 / friction and more, less what the fit of slopes misses",
+        low=0.0, high=20.0,
+    )  # fmt: skip
+    drag_sigma_slide: float = parameter(0.8, "rad", "how far a ground's value is from that", low=1e-3, high=10.0)
+    drag_slide_length: float = parameter(10.0, "m", "way over which the ground's value changes", low=0.1, high=1e4)
     drag_min_inclination_deg: float = parameter(
         8.0, "deg", "a rod less inclined has no clear direction: noise of 0.4 deg would turn it by 3", low=2.0, high=45.0
     )

@@ -1,22 +1,32 @@
 """Whiskers trail behind the motion: what their directions say about the body's velocity.
 
-A dragged tip on the ground moves along its rod's horizontal direction, towards the mount (a tractrix). With p the
-tip in base_link, d the unit vector from base to tip in the horizontal plane, n perpendicular to d, and p' the tip's
-motion within base_link:
+A dragged tip moves along its rod's horizontal direction, towards the mount (a tractrix). With p the tip in base_link,
+d the unit vector from tip to base in the horizontal plane, n perpendicular to d, and p' the tip's motion within
+base_link:
 
     n . (v + wz (-p_y, p_x) + p') = 0.
 
-In steady motion p' is zero and the tip trails against its motion; after starts, reversals and turns p' is what still
-turns the rod, so nothing has to be waited for. Slopes turn tips sideways: one whisker's error lasts some centimetres
-of the way, so a frame counts only by the way made since the last one.
+In steady motion p' is zero; after starts, reversals and turns it is what still turns the rod, so that nothing has to
+be waited for. Where the ground falls to one side, the spring pushes the tip down that side until friction holds it:
+the rod is turned by `slide` times the cross slope, where `slide` is near 1 / mu + cot(inclination) for a joint of the
+same stiffness in all directions. It depends on the ground and is estimated along the way from how the tips of a
+frame differ.
 
-The measurement is linearised at the estimated velocity: n is replaced by the perpendicular of the predicted motion of
-the tip. With the measured n, noise in n would pass for knowledge that the speed is small.
+What is left is no white noise: tips keep their errors for some centimetres (so a measurement is made once per
+`drag_spacing` of the way and counts by the way made), and the array as a whole errs too, the more the stronger it
+turns, because a rod's joint may be stiffer across than along. Measured on simulated drives; the numbers are in the
+configuration section `robust_estimation`.
+
+The measurement is an angle, so it says nothing of the speed. It must be linearised at a direction of motion that shares
+no noise with it: at the prediction, at what the measurement leads to, or with the measured n, the products of noise
+with itself pump the speed up or down, measurement by measurement. So it is linearised at the direction that the
+measurements before it showed, averaged over the way.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +34,7 @@ from numpy.typing import NDArray
 
 from robominer_slam.configuration.robust_estimation_section import RobustEstimationSection
 from robominer_slam.contacts import Contacts
+from robominer_slam.estimation.cross_slope import CrossSlope
 from robominer_slam.layout import WhiskerLayout
 
 FloatArray = NDArray[np.float64]
@@ -33,7 +44,21 @@ WINDOW = 3
 #: Longer ago than this, s, a tip's place says nothing about its motion.
 MAX_AGE_S = 0.3
 #: Fewer tips than this say nothing.
-LEAST_TIPS = 4
+LEAST_TIPS = 6
+#: A rod farther from its predicted direction than this (cosine) does not trail: it is held, or pushed.
+TRAILING = 0.6
+#: Steepest cross slope that is made up for: beyond, tips slip.
+STEEPEST = 0.4
+#: Cross slope at which a tip's deviation has grown by the square root of two.
+DOUBTFUL_SLOPE = 0.15
+#: Lever of the array, m, by which turning spreads the directions of its tips.
+ARM = 0.25
+#: Makes vx, vy, wz alike: m/s each.
+METRIC = np.array([1.0, 1.0, ARM])
+#: A prediction farther (cosine) from the direction that was shown before means a new way.
+SAME_DIRECTION = 0.9
+#: Way over which the shown direction is averaged, m.
+SHOWN_LENGTH = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,94 +78,222 @@ class DragInformation:
     def compressed(self) -> tuple[FloatArray, FloatArray]:
         """Rows H (k, 3) and innovations (k,) with unit covariance that say the same; k of 0 to 3."""
         values, vectors = np.linalg.eigh(self.information)
-        kept = values > 1e-9 * max(float(values[-1]), 1e-9)
+        kept = values > 1e-6 * float(values[-1])
         root = np.sqrt(values[kept])
         H = root[:, None] * vectors[:, kept].T
         return H, (vectors[:, kept].T @ self.vector) / root
 
 
 class DragDirection:
-    """Keeps the tips of the last frames and turns a frame into information."""
+    """Keeps the contacts of the last frames; turns a frame into information now and then.
+
+    Args:
+        settings: noise and limits, with units and reasons there.
+        layout: the array; only whiskers that point down count, the others are for walls.
+    """
 
     def __init__(self, settings: RobustEstimationSection, layout: WhiskerLayout) -> None:
-        """Only whiskers that point down count; the others are for walls."""
         self._settings = settings
         self._layout = layout
-        downward = -layout.R_base_whisker[:, 2, 2]
-        self._floor = downward >= math.cos(math.radians(settings.drag_mount_tilt_deg))
+        self._floor = -layout.R_base_whisker[:, 2, 2] >= math.cos(math.radians(settings.drag_mount_tilt_deg))
+        self._least_inclination = math.radians(settings.drag_min_inclination_deg)
         self._sigma2 = math.radians(settings.drag_sigma_deg) ** 2
-        self._history: list[tuple[int, FloatArray]] = []
+        self._slopes = CrossSlope(layout, self._floor)
+        self._frames: deque[tuple[int, Contacts]] = deque(maxlen=WINDOW + 1)
+        self._way = 0.0
         self._last_ns: int | None = None
+        self._direction: FloatArray | None = None
+        self._shown_way = 0.0
+        self._slide_information = settings.drag_sigma_slide**-2
+        #: Estimated angle by which a cross slope turns a rod, rad per slope.
+        self.slide = settings.drag_slide
 
     def reach(self, contacts: Contacts) -> FloatArray:
-        """Horizontal vectors from base to tip, shape (m, 2), m, in base_link."""
+        """Horizontal vectors from base to tip, shape (2, m), m, in base_link."""
         sine = np.sin(contacts.inclination)
         direction = np.stack(
             [sine * np.cos(contacts.azimuth), sine * np.sin(contacts.azimuth), np.cos(contacts.inclination)], axis=1
         )
         R = self._layout.R_base_whisker[contacts.index, :2]
-        rod: FloatArray = np.matmul(R, direction[:, :, None])[:, :, 0]
-        return rod * self._layout.length[contacts.index, None]
+        rod: FloatArray = np.matmul(R, direction[:, :, None])[:, :, 0].T
+        return rod * self._layout.length[contacts.index]
 
-    def measure(self, stamp_ns: int, contacts: Contacts, velocity: FloatArray) -> DragInformation | None:
+    def measure(
+        self, stamp_ns: int, contacts: Contacts, velocity: FloatArray, covariance: FloatArray
+    ) -> DragInformation | None:
         """Take a frame.
 
         Args:
             stamp_ns: of the frame.
             contacts: in base_link.
             velocity: estimated vx, vy (m/s), wz (rad/s), shape (3,).
+            covariance: of the velocity, shape (3, 3).
 
         Returns:
-            None where too few tips move.
+            None where too few tips move, or too little way was made since the last measurement.
         """
-        settings = self._settings
+        frames, settings = self._frames, self._settings
+        frames.append((stamp_ns, contacts))
+        before, self._last_ns = self._last_ns, stamp_ns
+        if before is None:
+            return None
+        speed = math.hypot(velocity[0], velocity[1]) + ARM * abs(velocity[2])
+        self._way += speed * (stamp_ns - before) * 1e-9
+        if self._way < settings.drag_spacing:
+            return None
+        way, self._way = self._way, 0.0
+        span = (stamp_ns - frames[0][0]) * 1e-9
+        if len(frames) <= WINDOW or span > MAX_AGE_S or len(contacts.index) < LEAST_TIPS:
+            return None
+        tips = self._trailing(contacts, frames[0][1], span, velocity)
+        if tips is None:
+            return None
+        scaled = velocity * METRIC
+        size = math.sqrt(scaled @ scaled)
+        direction = self._direction
+        if direction is None or direction @ scaled < SAME_DIRECTION * size:
+            direction, self._shown_way = scaled / size, 0.0
+        new_way = self._shown_way < settings.drag_length
+        found = self._information(tips, velocity, direction / METRIC * size)
+        shown = self._shown(found, velocity, covariance)
+        self._shown_way += way
+        direction = direction + way / min(self._shown_way, SHOWN_LENGTH) * (shown - direction)
+        self._direction = direction / math.sqrt(direction @ direction)
+        if new_way:
+            return None
+        self._learn_slide(found, covariance, min(1.0, way / (2.0 * settings.drag_length)))
+        discount = min(1.0, way / (2.0 * settings.drag_length))
+        shared = np.linalg.inv(np.eye(3) + found.information @ self._common(velocity)) * discount
+        information = shared @ found.information
+        return DragInformation(0.5 * (information + information.T), shared @ found.vector, found.tips)
+
+    def _trailing(self, contacts: Contacts, old: Contacts, span: float, velocity: FloatArray) -> _Tips | None:
         index = contacts.index
         rod = self.reach(contacts)
-        tips = np.full((self._layout.count, 2), np.nan)
-        tips[index] = rod
-        old = self._remember(stamp_ns, tips)
-        last, self._last_ns = self._last_ns, stamp_ns
-        if old is None or last is None or len(index) < LEAST_TIPS:
-            return None
-        span, before = old
-        turning = (rod - before[index]) / span
-        p = self._layout.p_base[index, :2] + rod
-        moving = np.empty_like(p)
-        moving[:, 0] = velocity[0] - velocity[2] * p[:, 1]
-        moving[:, 1] = velocity[1] + velocity[2] * p[:, 0]
-        swept = moving + turning
-        speed = np.sqrt(swept[:, 0] ** 2 + swept[:, 1] ** 2)
-        length = np.sqrt(rod[:, 0] ** 2 + rod[:, 1] ** 2)
+        earlier = np.full((2, self._layout.count), np.nan)
+        earlier[:, old.index] = self.reach(old)
+        turning = (rod - earlier[:, index]) / span
+        p = self._layout.p_base[index, :2].T + rod
+        swept = _swept(p, turning, velocity)
+        speed = np.sqrt(swept[0] ** 2 + swept[1] ** 2)
+        d = rod / -np.sqrt(rod[0] ** 2 + rod[1] ** 2)
         ok = (
             self._floor[index]
-            & (contacts.inclination > math.radians(settings.drag_min_inclination_deg))
-            & (speed > settings.drag_least_speed)
+            & (contacts.inclination > self._least_inclination)
+            & (speed > self._settings.drag_least_speed)
+            & (d[0] * swept[0] + d[1] * swept[1] > TRAILING * speed)
         )
-        ok &= (rod * swept).sum(axis=1) < -0.7 * length * speed
         if np.count_nonzero(ok) < LEAST_TIPS:
             return None
-        p, swept, speed = p[ok], swept[ok], speed[ok]
-        d = rod[ok] / length[ok, None]
-        # Sideways motion that the rod's direction denies, n . (v + wz x p + p'), with n to the left of the motion.
-        residual = -(d[:, 0] * swept[:, 1] - d[:, 1] * swept[:, 0])
-        m = np.stack([-swept[:, 1], swept[:, 0]], axis=1) / speed[:, None]
-        rows = np.column_stack([m, m[:, 1] * p[:, 0] - m[:, 0] * p[:, 1]])
-        angle = residual / speed
-        way = float(np.mean(speed)) * (stamp_ns - last) * 1e-9
-        discount = min(1.0, way / (2.0 * settings.drag_length))
-        weight = discount / (self._sigma2 * speed**2)
-        # Student's t with four degrees of freedom: a tip on a steep side counts little.
-        weight *= 5.0 / (4.0 + angle**2 / self._sigma2)
-        weighted = rows * weight[:, None]
-        return DragInformation(weighted.T @ rows, -(weighted.T @ residual), int(ok.sum()))
+        gradient = self._slopes.gradient(contacts.points, index)
+        return _Tips(p[:, ok], turning[:, ok], d[:, ok], gradient[:, ok], swept[:, ok])
 
-    def _remember(self, stamp_ns: int, tips: FloatArray) -> tuple[float, FloatArray] | None:
-        history = self._history
-        history.append((stamp_ns, tips))
-        if len(history) > WINDOW + 1:
-            history.pop(0)
-        while len(history) > 1 and stamp_ns - history[0][0] > MAX_AGE_S * 1e9:
-            history.pop(0)
-        if len(history) < 2:
-            return None
-        return (stamp_ns - history[0][0]) * 1e-9, history[0][1]
+    def _information(self, tips: _Tips, velocity: FloatArray, at: FloatArray) -> _Frame:
+        """What the tips say about the velocity's difference from `velocity`, linearised at `at`."""
+        rows, angle, cross, speed, weight = self._linearised(tips, _swept(tips.p, tips.turning, at))
+        steady = tips.swept - tips.turning
+        innovation = angle * speed - (rows[0] * steady[0] + rows[1] * steady[1])
+        weighted = rows * weight
+        sliding = cross * speed
+        return _Frame(
+            weighted @ rows.T,
+            weighted @ innovation,
+            len(angle),
+            weighted @ sliding,
+            float(sliding @ (weight * sliding)),
+            float(sliding @ (weight * innovation)),
+        )
+
+    @staticmethod
+    def _shown(found: _Frame, velocity: FloatArray, covariance: FloatArray) -> FloatArray:
+        """Direction of the motion as this frame shows it: scaled (vx, vy, wz) of length one."""
+        correction = np.linalg.solve(np.eye(3) + covariance @ found.information, covariance @ found.vector)
+        scaled = (velocity + correction) * METRIC
+        direction: FloatArray = scaled / max(math.sqrt(scaled @ scaled), 1e-9)
+        return direction
+
+    def _linearised(
+        self, tips: _Tips, swept: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Rows (3, m), angles from motion to rod (m,), cross slopes, speeds and weights at the motion `swept`."""
+        speed = np.maximum(np.sqrt(swept[0] ** 2 + swept[1] ** 2), self._settings.drag_least_speed)
+        ux, uy = swept / speed
+        cross = np.minimum(np.maximum(ux * tips.gradient[1] - uy * tips.gradient[0], -STEEPEST), STEEPEST)
+        angle = ux * tips.d[1] - uy * tips.d[0] - self.slide * cross
+        # Perpendicular to the steady motion: that p' does not grow with the speed must not tell the speed, for p' is
+        # mostly the ground's doing.
+        sx, sy = swept - tips.turning
+        steady = np.maximum(np.sqrt(sx**2 + sy**2), self._settings.drag_least_speed)
+        sx, sy = sx / steady, sy / steady
+        rows = np.stack([-sy, sx, sx * tips.p[0] + sy * tips.p[1]])
+        sigma2 = self._sigma2 * (1.0 + (cross / DOUBTFUL_SLOPE) ** 2)
+        # Student's t with four degrees of freedom: a tip at a steep side counts little.
+        weight = 5.0 / ((4.0 * sigma2 + angle**2) * speed**2)
+        return rows, angle, cross, speed, weight
+
+    def _common(self, velocity: FloatArray) -> FloatArray:
+        """Covariance of the velocity that the array says, of what its tips have in common, shape (3, 3)."""
+        settings = self._settings
+        speed = math.hypot(velocity[0], velocity[1])
+        # What turning adds lasts longer than the rest: it counts as if it did not average out for so long.
+        lasting = math.sqrt(max(settings.drag_turn_length / settings.drag_length, 1.0))
+        turn = settings.drag_turn_share * abs(velocity[2]) * lasting
+        side = (math.radians(settings.drag_common_deg) * speed) ** 2 + (turn * ARM) ** 2
+        common = np.zeros((3, 3))
+        if speed > 1e-9:
+            left = np.array([-velocity[1], velocity[0]]) / speed
+            common[:2, :2] = side * np.outer(left, left)
+        else:
+            common[0, 0] = common[1, 1] = side
+        common[2, 2] = turn**2 + (settings.drag_common_curvature * speed) ** 2
+        return common
+
+    def _learn_slide(self, found: _Frame, covariance: FloatArray, discount: float) -> None:
+        """Estimate `slide` from how the tips of this frame differ; what they have in common is the velocity's."""
+        both = np.column_stack([found.sliding_rows, found.vector])
+        to_velocity = np.linalg.solve(np.eye(3) + covariance @ found.information, covariance @ both)
+        shared = found.sliding_rows @ to_velocity
+        information = discount * max(found.sliding_sliding - float(shared[0]), 0.0)
+        vector = discount * (found.sliding_innovation - float(shared[1]))
+        settings = self._settings
+        # The ground changes: what was learned fades towards the prior.
+        prior = settings.drag_sigma_slide**-2
+        kept = math.exp(-settings.drag_spacing / settings.drag_slide_length)
+        self._slide_information = prior + kept * (self._slide_information - prior) + information
+        faded = settings.drag_slide + kept * (self.slide - settings.drag_slide)
+        self.slide = faded + vector / self._slide_information
+
+
+@dataclass(frozen=True, slots=True)
+class _Tips:
+    """Tips that trail: place p, motion in base_link, direction to the base, ground's gradient, predicted motion.
+
+    All of shape (2, m).
+    """
+
+    p: FloatArray
+    turning: FloatArray
+    d: FloatArray
+    gradient: FloatArray
+    swept: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    """A frame's information before what its tips have in common is allowed for.
+
+    information (3, 3), vector (3,) and tips as of `DragInformation`; sliding_*: weighted products of each tip's
+    derivative by `slide` with the rows (3,), with itself and with the innovations.
+    """
+
+    information: FloatArray
+    vector: FloatArray
+    tips: int
+    sliding_rows: FloatArray
+    sliding_sliding: float
+    sliding_innovation: float
+
+
+def _swept(p: FloatArray, turning: FloatArray, velocity: FloatArray) -> FloatArray:
+    """Motion of the tips over the ground in base_link's axes, shape (2, m), m/s; arguments as in the module's text."""
+    return np.stack([velocity[0] - velocity[2] * p[1] + turning[0], velocity[1] + velocity[2] * p[0] + turning[1]])

@@ -2,14 +2,17 @@
 
 State x = (x, y, yaw | vx, vy, wz | X, Y, YAW | slow states): pose of the levelled base_link in the levelled frame of
 the last keyframe, body velocity, that keyframe's pose in odom, and what the source of motion needs (biases, slip).
-Without a gyro the velocity is a random walk in all three axes; with one, the turn rate is its reading less the bias,
-an input. Levelled: turned about a horizontal axis until z points up; a tilted body's velocity counts by its
-horizontal part, u = level (vx, vy).
+Levelled: turned about a horizontal axis until z points up; a tilted body's velocity counts by its horizontal part.
+
+Velocities are random walks unless they are inputs: the turn rate is then the gyro's reading less its bias, the
+velocity what the screws would give without slip, times 1 - slip. As inputs, because a filter that weighs a
+measurement v / (1 - slip) against a walk of v reads slip out of every acceleration, where there is nothing to read.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
@@ -20,49 +23,90 @@ FloatArray = NDArray[np.float64]
 X, Y, YAW, VX, VY, WZ, KEY_X, KEY_Y, KEY_YAW, SLOW = range(10)
 LEVEL = np.eye(2)
 REL, VELOCITY, KEY = slice(X, VX), slice(VX, KEY_X), slice(KEY_X, SLOW)
-#: Where the gyro's bias stands, if there is a gyro.
-GYRO_BIAS = SLOW
+#: Slow states with gyro and screws: bias of the gyro, slip (mean and varying part) of vx, vy, wz.
+GYRO_BIAS, SLIP_MEAN, SLIP = SLOW, slice(SLOW + 1, SLOW + 4), slice(SLOW + 4, SLOW + 7)
 
 
-def motion(state: FloatArray, dt: float, gyro: float | None = None, level: FloatArray = LEVEL) -> FloatArray:
-    """The state `dt` seconds later at constant body velocity; midpoint in the heading.
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """What moves the state in an interval.
 
-    Args:
-        state: shape (n,).
-        dt: s.
-        gyro: mean reading of the vertical gyro in the interval, rad/s; None without one.
+    Attributes:
+        dt: length of the interval, s.
+        gyro: mean reading of the vertical gyro, rad/s; None: the turn rate walks.
+        screws: vx, vy of the screws without slip, shape (2,), m/s; None: the velocity walks.
         level: from body velocity (vx, vy) to its horizontal part ahead and to the left, shape (2, 2).
     """
+
+    dt: float
+    gyro: float | None = None
+    screws: FloatArray | None = None
+    level: FloatArray = field(default_factory=lambda: LEVEL)
+
+
+def velocity(state: FloatArray, inputs: Inputs) -> FloatArray:
+    """Body velocity in the interval, shape (3,)."""
+    moving = state[VELOCITY].copy()
+    if inputs.screws is not None:
+        moving[0] = inputs.screws[0] * (1.0 - state[SLIP_MEAN.start] - state[SLIP.start])
+        moving[1] = inputs.screws[1] * (1.0 - state[SLIP_MEAN.start + 1] - state[SLIP.start + 1])
+    if inputs.gyro is not None:
+        moving[2] = inputs.gyro - state[GYRO_BIAS]
+    return moving
+
+
+def velocity_jacobian(state: FloatArray, inputs: Inputs) -> FloatArray:
+    """Derivative of `velocity` by the state, shape (3, n)."""
+    V = np.zeros((3, len(state)))
+    if inputs.screws is None:
+        V[0, VX] = V[1, VY] = 1.0
+    else:
+        V[0, SLIP_MEAN.start] = V[0, SLIP.start] = -inputs.screws[0]
+        V[1, SLIP_MEAN.start + 1] = V[1, SLIP.start + 1] = -inputs.screws[1]
+    if inputs.gyro is None:
+        V[2, WZ] = 1.0
+    else:
+        V[2, GYRO_BIAS] = -1.0
+    return V
+
+
+def motion(state: FloatArray, inputs: Inputs) -> FloatArray:
+    """The state after an interval at constant body velocity; midpoint in the heading."""
     later = state.copy()
-    if gyro is not None:
-        later[WZ] = gyro - state[GYRO_BIAS]
-    turn = later[WZ] * dt
+    moving = velocity(state, inputs)
+    later[VELOCITY] = moving
+    dt = inputs.dt
+    turn = moving[2] * dt
     c, s = math.cos(state[YAW] + 0.5 * turn) * dt, math.sin(state[YAW] + 0.5 * turn) * dt
-    ahead, left = level @ state[VX:WZ]
+    ahead, left = inputs.level @ moving[:2]
     later[X] += c * ahead - s * left
     later[Y] += s * ahead + c * left
     later[YAW] += turn
     return later
 
 
-def motion_jacobian(state: FloatArray, dt: float, gyro: float | None = None, level: FloatArray = LEVEL) -> FloatArray:
-    """Derivative of `motion` by the state, shape (n, n)."""
-    F = np.eye(len(state))
-    rate = state[WZ] if gyro is None else gyro - state[GYRO_BIAS]
-    heading = state[YAW] + 0.5 * rate * dt
+def motion_jacobian(state: FloatArray, inputs: Inputs) -> tuple[FloatArray, FloatArray]:
+    """Derivatives of `motion` by the state, (n, n), and of the pose (x, y, yaw) by the velocity, (3, 3)."""
+    moving = velocity(state, inputs)
+    dt = inputs.dt
+    heading = state[YAW] + 0.5 * moving[2] * dt
     c, s = math.cos(heading) * dt, math.sin(heading) * dt
-    ahead, left = level @ state[VX:WZ]
+    (a, b), (d, e) = inputs.level
+    ahead, left = a * moving[0] + b * moving[1], d * moving[0] + e * moving[1]
     dx, dy = -s * ahead - c * left, c * ahead - s * left
+    D = np.array(
+        [
+            [c * a - s * d, c * b - s * e, 0.5 * dt * dx],
+            [s * a + c * d, s * b + c * e, 0.5 * dt * dy],
+            [0.0, 0.0, dt],
+        ]
+    )
+    V = velocity_jacobian(state, inputs)
+    F = np.eye(len(state))
+    F[VELOCITY] = V
+    F[REL] += D @ V
     F[X, YAW], F[Y, YAW] = dx, dy
-    (a, b), (d, e) = level
-    F[X, VX], F[X, VY] = c * a - s * d, c * b - s * e
-    F[Y, VX], F[Y, VY] = s * a + c * d, s * b + c * e
-    turning = WZ if gyro is None else GYRO_BIAS
-    sign = 1.0 if gyro is None else -1.0
-    F[X, turning], F[Y, turning], F[YAW, turning] = sign * 0.5 * dt * dx, sign * 0.5 * dt * dy, sign * dt
-    if gyro is not None:
-        F[WZ, WZ], F[WZ, GYRO_BIAS] = 0.0, -1.0
-    return F
+    return F, D
 
 
 def compose(state: FloatArray) -> FloatArray:
@@ -102,57 +146,64 @@ class PlanarFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has 
         self.P: FloatArray = P
         self.gate = gate
         self.outliers = 0
-        self._dt = 0.0
-        self._gyro: float | None = None
-        self._level = LEVEL
-        self._fading: tuple[slice, float] | None = None
+        self._inputs = Inputs(0.0)
+        self._fading = 1.0
 
     def predict_x(self, u: float = 0.0) -> None:  # noqa: ARG002 - filterpy's signature; there is no input
         """Move the state."""
-        self.x = motion(self.x, self._dt, self._gyro, self._level)
-        if self._fading is not None:
-            self.x[self._fading[0]] *= self._fading[1]
+        self.x = motion(self.x, self._inputs)
+        if self._fading < 1.0:
+            self.x[SLIP] *= self._fading
 
-    def move(
-        self,
-        dt: float,
-        Q: FloatArray,
-        gyro: float | None = None,
-        level: FloatArray = LEVEL,
-        fading: tuple[slice, float] | None = None,
-    ) -> None:
-        """Predict `dt` seconds ahead.
+    def move(self, inputs: Inputs, Q_velocity: FloatArray, q: FloatArray, fading: float = 1.0) -> None:
+        """Predict to the end of an interval.
 
         Args:
-            dt, gyro, level: as of `motion`.
-            Q: the noise that the motion adds, shape (n, n).
-            fading: states of a Gauss-Markov process, and by what factor they fade.
+            inputs: what moves the state.
+            Q_velocity: covariance of the velocity in the interval, shape (3, 3).
+            q: variances that the interval adds to the states, shape (n,).
+            fading: factor by which the varying slip fades.
         """
-        self._dt, self._gyro, self._level, self._fading = dt, gyro, level, fading
-        self.F = motion_jacobian(self.x, dt, gyro, level)
-        if fading is not None:
-            which = np.arange(len(self.x))[fading[0]]
-            self.F[which, which] = fading[1]
-        self.Q = Q
+        self._inputs, self._fading = inputs, fading
+        F, D = motion_jacobian(self.x, inputs)
+        Q = np.diag(q)
+        by_velocity = D @ Q_velocity
+        Q[REL, REL] += by_velocity @ D.T
+        Q[REL, VELOCITY] = by_velocity
+        Q[VELOCITY, REL] = by_velocity.T
+        Q[VELOCITY, VELOCITY] += Q_velocity
+        if fading < 1.0:
+            F[SLIP, SLIP] *= fading
+        self.F, self.Q = F, Q
         self.predict()
 
-    def correct(self, innovation: FloatArray, H: FloatArray, R: FloatArray) -> float:
+    def correct(self, innovation: FloatArray, H: FloatArray, R: FloatArray, held: FloatArray | None = None) -> float:
         """Update with a measurement that differs from its prediction by `innovation`, shape (m,).
 
         Args:
             innovation: measured less predicted.
             H: derivative of the prediction by the state, shape (m, n).
             R: covariance of the measurement, shape (m, m).
+            held: orthonormal rows, shape (k, n): combinations of states that this measurement must not move.
 
         Returns:
             The squared Mahalanobis distance.
         """
-        S = H @ self.P @ H.T + R
+        PHT = self.P @ H.T
+        S = H @ PHT + R
         distance = float(innovation @ np.linalg.solve(S, innovation))
         if distance > self.gate:
             self.outliers += 1
             R = R * (distance / self.gate)
-        self.update(innovation, lambda _: H, lambda _: np.zeros(len(innovation)), R)
+        if held is None:
+            self.update(innovation, lambda _: H, lambda _: np.zeros(len(innovation)), R)
+            return distance
+        # Any gain is allowed as long as the covariance follows it (Joseph's form); this one leaves `held` alone.
+        gain = np.linalg.solve(H @ PHT + R, PHT.T).T
+        gain -= held.T @ (held @ gain)
+        left = np.eye(len(self.x)) - gain @ H
+        self.x = self.x + gain @ innovation
+        self.P = left @ self.P @ left.T + gain @ R @ gain.T
         return distance
 
     def keyframe(self) -> None:

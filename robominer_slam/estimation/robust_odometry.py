@@ -28,6 +28,8 @@ from robominer_slam.estimation.planar_motion import (
     GYRO_BIAS,
     KEY_YAW,
     REL,
+    SLIP,
+    SLIP_MEAN,
     SLOW,
     VELOCITY,
     VX,
@@ -36,6 +38,7 @@ from robominer_slam.estimation.planar_motion import (
     X,
     Y,
     YAW,
+    Inputs,
     PlanarFilter,
     compose,
     compose_jacobian,
@@ -47,11 +50,12 @@ Source = Literal["fused", "odometry"]
 
 #: A gap in readings longer than this has no meaningful mean speed.
 MAX_INTERVAL_S = 0.5
-#: States of the sources after the common nine.
+#: Slow states with a ready-made odometry: its biases of vx, vy, wz.
 ODOMETRY_BIAS = slice(SLOW, SLOW + 3)
-SLIP_MEAN, SLIP = slice(SLOW + 1, SLOW + 4), slice(SLOW + 4, SLOW + 7)
 #: Less information about a direction, 1/m2 or 1/rad2, is none.
 LEAST_INFORMATION = 1.0
+#: Screws and gyro are compared over so long, s.
+TURN_WINDOW_S = 0.2
 #: Velocity at the start may be anything a robot does.
 SIGMA_START = np.array([0.01, 0.01, 0.01])
 #: More slip than this is a robot that is stuck: the model ends there.
@@ -60,21 +64,18 @@ MAX_SLIP = 0.9
 SIGMA_Z, SIGMA_TILT = 0.005, 0.005
 
 
-def slipping_screws(state: FloatArray) -> FloatArray:
-    """What the screws' kinematics say while the body moves as in `state`, shape (3,)."""
-    grip = np.maximum(1.0 - state[SLIP_MEAN] - state[SLIP], 1.0 - MAX_SLIP)
-    screws: FloatArray = state[VELOCITY] / grip
-    return screws
+def screw_turn(state: FloatArray, gyro_angle: float, span: float) -> FloatArray:
+    """Angle by which the screws seem to turn the body while the gyro reads `gyro_angle`, rad, shape (1,)."""
+    grip = max(1.0 - state[SLIP_MEAN.stop - 1] - state[SLIP.stop - 1], 1.0 - MAX_SLIP)
+    return np.array([(gyro_angle - state[GYRO_BIAS] * span) / grip])
 
 
-def slipping_screws_jacobian(state: FloatArray) -> FloatArray:
-    """Derivative of `slipping_screws` by the state, shape (3, n)."""
-    grip = np.maximum(1.0 - state[SLIP_MEAN] - state[SLIP], 1.0 - MAX_SLIP)
-    by_slip = state[VELOCITY] / grip**2
-    H = np.zeros((3, len(state)))
-    for k in range(3):
-        H[k, VX + k] = 1.0 / grip[k]
-        H[k, SLIP_MEAN.start + k] = H[k, SLIP.start + k] = by_slip[k]
+def screw_turn_jacobian(state: FloatArray, gyro_angle: float, span: float) -> FloatArray:
+    """Derivative of `screw_turn` by the state, shape (1, n)."""
+    grip = max(1.0 - state[SLIP_MEAN.stop - 1] - state[SLIP.stop - 1], 1.0 - MAX_SLIP)
+    H = np.zeros((1, len(state)))
+    H[0, GYRO_BIAS] = -span / grip
+    H[0, SLIP_MEAN.stop - 1] = H[0, SLIP.stop - 1] = (gyro_angle - state[GYRO_BIAS] * span) / grip**2
     return H
 
 
@@ -118,13 +119,18 @@ class RobustOdometry:
         self._H_odometry = self._H_velocity.copy()
         if not fused:
             self._H_odometry[:, ODOMETRY_BIAS] = np.eye(3)
-        self._R_still = np.eye(3) * settings.sigma_still**2
         self._R_screws = (screw_matrix[:3] @ screw_matrix[:3].T) * settings.sigma_screw_speed**2
         self._speeds = ScrewSpeedAssembly()
         self._gyro = GyroBatch()
         self._stamp_ns: int | None = None
         self._screws: ScrewAngles | None = None
         self._odometry_ns: int | None = None
+        self._screws_ns: int | None = None
+        self._input, self._Q_input = np.zeros(2), np.zeros((2, 2))
+        self._turn_variance = 0.0
+        self._turn_gyro: float | None = None
+        self._turn_screws = self._turn_span = 0.0
+        self._turn_readings, self._turn_still = 0, True
         self.stale = 0
 
     def add(self, measurement: Measurement) -> None:
@@ -150,13 +156,38 @@ class RobustOdometry:
         if self._drag is None:
             return
         self._predict(stamp_ns)
-        found = self._drag.measure(stamp_ns, contacts, self._filter.x[VELOCITY])
+        ekf = self._filter
+        found = self._drag.measure(stamp_ns, contacts, ekf.x[VELOCITY], ekf.P[VELOCITY, VELOCITY])
         if found is None:
             return
         rows, innovation = found.compressed()
         H = np.zeros((len(rows), len(self._filter.x)))
         H[:, VELOCITY] = rows
-        self._filter.correct(innovation, H, np.eye(len(rows)))
+        ekf.correct(innovation, H, np.eye(len(rows)), self._along_motion())
+
+    def _along_motion(self) -> FloatArray:
+        """Combinations of states that are motion ahead, shape (k, n): the drag's angle must not move them.
+
+        Its derivative by them is zero but for noise in the direction, which repeated updates would take for
+        knowledge of the speed.
+        """
+        x = self._filter.x
+        vx, vy = x[VX], x[VY]
+        size = max(math.hypot(vx, vy), 1e-9)
+        ahead = np.array([vx, vy]) / size
+        c, s = math.cos(x[YAW]), math.sin(x[YAW])
+        if self._source == "odometry":
+            held = np.zeros((3, len(x)))
+            held[2, SLOW : SLOW + 2] = ahead
+        else:
+            held = np.zeros((4, len(x)))
+            by_slip = ahead * self._input
+            by_slip = by_slip / max(math.hypot(by_slip[0], by_slip[1]), 1e-9)
+            held[2, SLIP_MEAN.start : SLIP_MEAN.start + 2] = by_slip
+            held[3, SLIP.start : SLIP.start + 2] = by_slip
+        held[0, VX:WZ] = ahead
+        held[1, X:YAW] = c * ahead[0] - s * ahead[1], s * ahead[0] + c * ahead[1]
+        return held
 
     def measures_motion(self, measurement: Measurement) -> bool:
         """Screws do if all four are heard of, or the ready-made odometry; a gyro alone does not."""
@@ -277,14 +308,51 @@ class RobustOdometry:
         self._update_screws(reading.stamp_ns, (reading.angle - previous.angle) / interval)
 
     def _update_screws(self, stamp_ns: int, speed: FloatArray) -> None:
-        self._predict(stamp_ns)
-        ekf = self._filter
-        if np.abs(speed).max() < self._settings.still_screw_speed:
-            ekf.correct(-ekf.x[VELOCITY], self._H_velocity, self._R_still)
-            return
+        before = self._screws_ns
+        self._screws_ns = stamp_ns
         screws = self._screw_matrix @ speed
-        R = self._R_screws + np.eye(3) * (self._settings.slip_mode_weight * screws[3]) ** 2
-        ekf.correct(screws[:3] - slipping_screws(ekf.x), slipping_screws_jacobian(ekf.x), R)
+        still = float(np.abs(speed).max()) < self._settings.still_screw_speed
+        self._use_screws(screws, still)
+        self._predict(stamp_ns)
+        if before is None or self._turn_gyro is None:
+            self._start_turn_window()
+            return
+        dt = (stamp_ns - before) * 1e-9
+        self._turn_screws += screws[2] * dt
+        self._turn_readings += 1
+        self._turn_still &= still
+        if self._turn_span >= TURN_WINDOW_S:
+            self._compare_turn()
+            self._start_turn_window()
+
+    def _use_screws(self, screws: FloatArray, still: bool) -> None:
+        """Make a reading of all screws (vx, vy, wz, slip mode) the input from now on."""
+        settings = self._settings
+        self._input = screws[:2]
+        if still:
+            self._Q_input = np.eye(2) * settings.sigma_still**2
+            return
+        doubt = (settings.slip_mode_weight * screws[3]) ** 2
+        self._Q_input = self._R_screws[:2, :2] + np.eye(2) * doubt
+
+    def _compare_turn(self) -> None:
+        ekf, settings = self._filter, self._settings
+        gyro_angle, span = self._turn_gyro, self._turn_span
+        assert gyro_angle is not None
+        noise = self._turn_variance
+        if self._turn_still:
+            H = np.zeros((1, len(ekf.x)))
+            H[0, GYRO_BIAS] = span
+            R = noise + (settings.sigma_still * span) ** 2
+            ekf.correct(np.array([gyro_angle - ekf.x[GYRO_BIAS] * span]), H, np.array([[R]]))
+            return
+        R = noise + self._R_screws[2, 2] * span**2 / self._turn_readings
+        innovation = self._turn_screws - screw_turn(ekf.x, gyro_angle, span)
+        ekf.correct(innovation, screw_turn_jacobian(ekf.x, gyro_angle, span), np.array([[R]]))
+
+    def _start_turn_window(self) -> None:
+        self._turn_gyro, self._turn_screws, self._turn_span = 0.0, 0.0, 0.0
+        self._turn_variance, self._turn_readings, self._turn_still = 0.0, 0, True
 
     def _predict(self, stamp_ns: int) -> None:
         previous = self._stamp_ns
@@ -295,28 +363,32 @@ class RobustOdometry:
         settings, ekf = self._settings, self._filter
         dt = (stamp_ns - previous) * 1e-9
         x = ekf.x
-        n = len(x)
-        q = np.zeros(n)
+        q = np.zeros(len(x))
         way = math.hypot(x[VX], x[VY]) * dt
         q[X] = q[Y] = settings.position_walk**2 * way
-        q[VX] = q[VY] = settings.acceleration_walk**2 * dt
-        gyro, fading = None, None
+        walk = settings.acceleration_walk**2 * dt
+        Q_velocity = np.diag([walk, walk, settings.angular_acceleration_walk**2 * dt])
+        gyro = screws = None
+        kept = 1.0
         if self._source == "fused":
             samples = max(self._gyro.samples, 1)
             rate = self._gyro.mean(previous, stamp_ns)
-            gyro = None if rate is None else float(rate[2])
+            if rate is not None:
+                gyro = float(rate[2])
+                Q_velocity[2, 2] = settings.sigma_gyro**2 / samples
+                if self._turn_gyro is not None:
+                    self._turn_gyro += gyro * dt
+                    self._turn_span += dt
+                    self._turn_variance += Q_velocity[2, 2] * dt * dt
+            else:
+                self._turn_gyro = None
+            if self._screws_ns is not None and stamp_ns - self._screws_ns < MAX_INTERVAL_S * 1e9:
+                screws = self._input
+                Q_velocity[:2, :2] = self._Q_input
             q[GYRO_BIAS] = settings.gyro_bias_walk**2 * dt
             way += abs(float(x[WZ])) * dt * settings.slip_turn_arm
             kept = math.exp(-way / settings.slip_length)
-            fading = (SLIP, kept)
             q[SLIP] = settings.sigma_slip**2 * (1.0 - kept * kept)
         else:
             q[ODOMETRY_BIAS] = settings.odometry_bias_walk**2 * dt
-        Q = np.diag(q)
-        if gyro is None:
-            Q[WZ, WZ] = settings.angular_acceleration_walk**2 * dt
-        else:
-            variance = settings.sigma_gyro**2 / samples
-            Q[WZ, WZ], Q[YAW, YAW] = variance, variance * dt * dt
-            Q[WZ, YAW] = Q[YAW, WZ] = variance * dt
-        ekf.move(dt, Q, gyro, fading=fading)
+        ekf.move(Inputs(dt, gyro, screws), Q_velocity, q, kept)

@@ -18,7 +18,7 @@ from robominer_slam import geometry
 from robominer_slam.configuration.robust_slam_section import ClosureSection
 from robominer_slam.slam.correlative_search import SearchGrid, grid_around, search
 from robominer_slam.slam.surface import Surface, SurfaceModel
-from robominer_slam.slam.surface_registration import YAW, SurfaceMatch, X, Y, Z, fit, placed
+from robominer_slam.slam.surface_registration import YAW, SurfaceMatch, X, Y, Z, fit, height_left_free, placed
 
 FloatArray = NDArray[np.float64]
 
@@ -183,10 +183,9 @@ class ClosureSearch:
         dz: float,
     ) -> Closure:
         p = self._parameters
-        H = match.information
-        planar = H[:3, :3] - np.outer(H[:3, Z], H[Z, :3]) / max(H[Z, Z], 1e-12)
+        planar = height_left_free(match.information)
         floor = np.square([p.floor, p.floor, np.deg2rad(p.floor_yaw_deg)])
-        covariance = p.inflation * np.linalg.pinv(planar, rcond=1e-12, hermitian=True) + np.diag(floor)
+        covariance = p.inflation * np.linalg.inv(planar + np.eye(3)) + np.diag(floor)
         least = np.linalg.eigvalsh(planar)[0]
         off = match.pose[:3] - prediction
         off[YAW] = geometry.wrap_angle(off[YAW])

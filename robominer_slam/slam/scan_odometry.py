@@ -16,7 +16,7 @@ from robominer_slam.configuration.robust_slam_section import ScanMatchingSection
 from robominer_slam.geometry import wrap_angle
 from robominer_slam.slam.local_map import LocalMap
 from robominer_slam.slam.surface import SurfaceModel
-from robominer_slam.slam.surface_registration import YAW, Z, fit, placed
+from robominer_slam.slam.surface_registration import YAW, Z, fit, height_left_free, placed
 
 FloatArray = NDArray[np.float64]
 
@@ -99,12 +99,12 @@ class ScanOdometry:
         offset = found.pose - pose
         offset[YAW] = wrap_angle(offset[YAW])
         # With the common height left free: what remains is about x, y and heading.
-        H = found.information * self._parameters.share
-        planar = H[:3, :3] - np.outer(H[:3, Z], H[Z, :3]) / max(H[Z, Z], 1e-12)
+        information = height_left_free(found.information) * self._parameters.share
         # The least-squares offset of the touches alone: H d = -g at the predicted pose.
-        gradient = found.gradient * self._parameters.share - H @ offset
+        H = found.curvature
+        gradient = found.gradient - H @ offset
         reduced = gradient[:3] - H[:3, Z] * gradient[Z] / max(H[Z, Z], 1e-12)
-        return ScanCorrection(_least(planar, -reduced), planar, float(offset[Z]))
+        return ScanCorrection(_least(height_left_free(H), -reduced), information, float(offset[Z]))
 
     def add(self, pose: FloatArray, points: FloatArray) -> None:
         """Put a frame's contacts (in base_link, levelled) into the map at its corrected pose (x, y, yaw, z)."""

@@ -22,6 +22,8 @@ FloatArray = NDArray[np.float64]
 #: Touches that make up the surface at one place, at most and at least.
 NEIGHBOURS = 10
 LEAST_NEIGHBOURS = 4
+#: A few touches may lie in a plane by chance: their misfit, in variances, counts as no less.
+LEAST_MISFIT = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,12 +52,14 @@ class SurfacePatches:
         height: shape (m,), m; 0 where it is not known.
         slope: dz/dx, dz/dy, shape (m, 2).
         variance: of a new touch's height there, shape (m,), m2.
+        slope_noise: covariance of the slope by the touches' errors, shape (m, 2, 2): what of it is no ground.
     """
 
     known: NDArray[np.bool_]
     height: FloatArray
     slope: FloatArray
     variance: FloatArray
+    slope_noise: FloatArray
 
 
 class Surface:
@@ -78,7 +82,8 @@ class Surface:
         """The surface at places of shape (m, 2), m."""
         m = len(xy)
         if self._tree is None or len(self.points) < LEAST_NEIGHBOURS or m == 0:
-            return SurfacePatches(np.zeros(m, dtype=np.bool_), np.zeros(m), np.zeros((m, 2)), np.ones(m))
+            none = np.zeros((m, 2, 2))
+            return SurfacePatches(np.zeros(m, dtype=np.bool_), np.zeros(m), np.zeros((m, 2)), np.ones(m), none)
         model = self._model
         distance, index = self._tree.query(xy, k=NEIGHBOURS, distance_upper_bound=model.reach)
         near = index < len(self.points)
@@ -102,4 +107,9 @@ class Surface:
         misfit = (weight * residual**2).sum(axis=1) / np.maximum(count - 1, 1)
         known = count >= LEAST_NEIGHBOURS
         variance = covariance[:, 0, 0] * np.maximum(misfit, 1.0) + model.touch_sigma**2
-        return SurfacePatches(known, np.where(known, datum + fitted[:, 0], 0.0), fitted[:, 1:], variance)
+        # The estimate is C X'W z: errors of z with covariance W^-1 reach it as C X'WX C = C - C prior C.
+        by_slope = covariance[:, 1:, 1:]
+        slope_noise = by_slope - (by_slope @ by_slope) / model.slope_sigma**2
+        slope_noise *= np.clip(misfit, LEAST_MISFIT, None)[:, None, None]
+        height = np.where(known, datum + fitted[:, 0], 0.0)
+        return SurfacePatches(known, height, fitted[:, 1:], variance, slope_noise)

@@ -2,7 +2,8 @@
 
 Each touch has the residual r = z - h(x, y); its slope by the pose comes from the surface's slope. Gauss-Newton with
 a Cauchy weight per touch (side contacts, whiskers on whiskers, edges), and a Gaussian prior where there is one. The
-information matrix H = J' W J tells which directions the ground constrains: on a flat floor only z.
+information matrix H = J' W J tells which directions the ground constrains: on a flat floor only z. The slopes in J
+are estimates, whose errors alone make J' W J look informed; what they add is taken off again.
 
 Sources: Zhang, "Parameter estimation techniques" (1997) for the weights; Censi, "An accurate closed-form estimate of
 ICP's covariance" (ICRA 2007) for what H says and what it does not (touches share the errors of their whiskers).
@@ -36,7 +37,9 @@ class SurfaceMatch:
 
     Attributes:
         pose: x, y (m), yaw (rad), z (m) of the touches' frame in the surface's, shape (4,).
-        information: H at the pose, prior left out, shape (4, 4).
+        information: H at the pose, prior left out, the slopes' errors taken off, shape (4, 4); positive
+            semidefinite.
+        curvature: J' W J itself, shape (4, 4).
         gradient: J' W r at the pose, prior left out, shape (4,): where the touches alone would pull.
         overlap: share of the touches that lie where the surface is known.
         inliers: share of those whose residual is within three sigmas.
@@ -46,6 +49,7 @@ class SurfaceMatch:
 
     pose: FloatArray
     information: FloatArray
+    curvature: FloatArray
     gradient: FloatArray
     overlap: float
     inliers: float
@@ -94,7 +98,8 @@ def fit(
         patches = surface.at(q[:, :2])
         known = patches.known
         if int(known.sum()) < 4:
-            return SurfaceMatch(pose, np.zeros((4, 4)), np.zeros(4), float(known.mean()), 0.0, 0.0, 0.0)
+            nothing = np.zeros((4, 4))
+            return SurfaceMatch(pose, nothing, nothing, np.zeros(4), float(known.mean()), 0.0, 0.0, 0.0)
         r = q[known, 2] - patches.height[known]
         J = residual_jacobian(q[known], pose, patches.slope[known])
         inverse_variance = 1.0 / patches.variance[known]
@@ -109,11 +114,48 @@ def fit(
             step = np.linalg.solve(H + regular, -JtW @ r - prior_information @ offset)
         gradient = JtW @ (r + J @ step)
         pose = pose + step
-    return _judged(pose, H, gradient, patches, q, r + J @ step)
+    noise = slope_noise_information(q[known], pose, patches.slope_noise[known], weight)
+    return _judged(pose, (_less(H, noise), H), gradient, patches, q, r + J @ step)
+
+
+def height_left_free(H: FloatArray) -> FloatArray:
+    """Information about (x, y, yaw), shape (3, 3), of one about (x, y, yaw, z): the Schur complement of z."""
+    planar: FloatArray = H[:3, :3] - np.outer(H[:3, Z], H[Z, :3]) / max(float(H[Z, Z]), 1e-12)
+    return planar
+
+
+def slope_noise_information(q: FloatArray, pose: FloatArray, slope_noise: FloatArray, weight: FloatArray) -> FloatArray:
+    """What errors of the slopes add to J' W J in the mean, shape (4, 4).
+
+    Args:
+        q: touches on the surface, shape (m, 3), m.
+        pose: of their frame, shape (4,).
+        slope_noise: covariance of the slopes there, shape (m, 2, 2).
+        weight: of the touches, shape (m,).
+    """
+    M = np.zeros((len(q), 2, 3))  # J = slope M
+    M[:, 0, X] = M[:, 1, Y] = -1.0
+    M[:, 0, YAW], M[:, 1, YAW] = q[:, 1] - pose[Y], pose[X] - q[:, 0]
+    added = np.zeros((4, 4))
+    added[:3, :3] = np.einsum("m,mia,mij,mjb->ab", weight, M, slope_noise, M)
+    return added
+
+
+def _less(H: FloatArray, noise: FloatArray) -> FloatArray:
+    """H without twice what noise adds (it adds so much in the mean, and may add more), kept positive semidefinite."""
+    values, vectors = np.linalg.eigh(H)
+    kept = np.einsum("ia,ij,ja->a", vectors, noise, vectors)
+    share = np.clip(1.0 - 2.0 * kept / np.maximum(values, 1e-12), 0.0, 1.0)
+    return np.asarray((vectors * (values * share)) @ vectors.T)
 
 
 def _judged(
-    pose: FloatArray, H: FloatArray, gradient: FloatArray, patches: SurfacePatches, q: FloatArray, residual: FloatArray
+    pose: FloatArray,
+    H: tuple[FloatArray, FloatArray],
+    gradient: FloatArray,
+    patches: SurfacePatches,
+    q: FloatArray,
+    residual: FloatArray,
 ) -> SurfaceMatch:
     known = patches.known
     fits = np.abs(residual) < INLIER_SIGMAS * np.sqrt(patches.variance[known])
@@ -123,4 +165,4 @@ def _judged(
     plane = np.column_stack([np.ones(len(xy)), xy])
     tilt, *_ = np.linalg.lstsq(plane, heights, rcond=None)
     relief = float(np.std(heights - plane @ tilt))
-    return SurfaceMatch(pose, H, gradient, float(known.mean()), float(fits.mean()), rms, relief)
+    return SurfaceMatch(pose, *H, gradient, float(known.mean()), float(fits.mean()), rms, relief)
