@@ -130,10 +130,13 @@ class MapStore:
         written: keyframes on the disk.
         fault: why nothing is being written now; empty if all is well.
         dropped: keyframes that could not be written because the disk has been failing for long.
+        frozen: whether the map must stay as it is: nothing is written then.
     """
 
-    def __init__(self, path: Path, sync_s: float, robot: str, name: str, map_id: int | None = None) -> None:
-        """Open the database; keyframes go into a new map, or are added to that of `map_id`."""
+    def __init__(
+        self, path: Path, sync_s: float, robot: str, name: str, map_id: int | None = None, frozen: bool = False
+    ) -> None:
+        """Open the database; keyframes go into a new map, or are added to that of `map_id`, which may be frozen."""
         self._connection = open_database(path)
         self._lock = threading.Lock()
         self._sync_s = sync_s
@@ -144,6 +147,7 @@ class MapStore:
         self._poses_written: dict[int, FloatArray] = {}
         self._weights_written: dict[EdgeKey, float] = {}
         self._poses_time = time.monotonic()
+        self.frozen = frozen
         self.written = 0
         self.dropped = 0
         self.fault = ""
@@ -161,6 +165,8 @@ class MapStore:
 
     def add(self, result: BackendResult, clock_offset_ns: int) -> None:
         """Keep a result's new keyframes and edges, and in time its poses; never waits for the disk."""
+        if self.frozen:
+            return
         edges = tuple(e for e in result.edges if (e.kind, e.i, e.j) not in self._edges_seen)
         try:
             self._queue.put_nowait(Item(result, edges, clock_offset_ns))
@@ -177,13 +183,15 @@ class MapStore:
             ids: of these keyframes; None for 0, 1, 2, ...
             edges: of the graph, whose weights may have changed.
         """
+        if self.frozen:
+            return
         self._moved = None
         self._update(poses, range(len(poses)) if ids is None else ids, edges)
 
     def _update(self, poses: FloatArray, ids: Iterable[int], edges: Sequence[GraphEdge]) -> None:
         places = dict(zip(ids, poses, strict=True))
         moved = {k: T for k, T in places.items() if self._differs(k, T)}
-        weights = {(e.kind, e.i, e.j): e.weight for e in edges}
+        weights: dict[EdgeKey, float] = {(e.kind, e.i, e.j): e.weight for e in edges}
         weights = {key: w for key, w in weights.items() if self._weights_written.get(key) != w}
         pose_rows = [(_pack_pose(T), self.map_id, k) for k, T in moved.items()]
         weight_rows = [(w, self.map_id, *key) for key, w in weights.items()]
@@ -211,9 +219,15 @@ class MapStore:
         self.flush(self._sync_s * 2)
         with self._lock:
             self.map_id = self._start_map(robot, name)
+        self.frozen = False
         self._edges_seen = set()
         self._moved = None
         self._poses_written, self._weights_written = {}, {}
+
+    @property
+    def waiting(self) -> int:
+        """Results that have not been written yet; beyond QUEUE_LENGTH they are dropped."""
+        return self._queue.qsize()
 
     def flush(self, timeout_s: float) -> bool:
         """Wait until what was added so far is on the disk; False if it took longer."""

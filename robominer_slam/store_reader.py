@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robominer_slam import geometry
+from robominer_slam.configuration.file import ConfigurationError
+from robominer_slam.configuration.model import SlamSection
 from robominer_slam.slam.keyframe import GraphEdge, Keyframe
 from robominer_slam.slam.saved_map import SavedMap
 from robominer_slam.store import UPPER, StoreError, open_database, unpack_points
@@ -79,6 +81,40 @@ def load_map(path: Path, wanted: str = "", clock_offset_ns: int = 0) -> tuple[in
     known = {k.id for k in keyframes}
     edges = tuple(_edge(row) for row in edge_rows if row[1] in known and row[2] in known)
     return map_id, SavedMap(keyframes, poses, edges, name or str(map_id))
+
+
+def map_to_start_in(
+    slam: SlamSection, path: Path, clock_offset_ns: int = 0
+) -> tuple[int, SavedMap] | tuple[None, None]:
+    """The map that `[slam] start` and `map` ask for; none for a new one.
+
+    `continue` without a name begins a new map where there is none yet: a robot's first start is like any other.
+
+    Raises:
+        ConfigurationError: the method cannot start in a map.
+        StoreError: there is no such map.
+    """
+    if slam.start == "new":
+        return None, None
+    if slam.method != "robust":
+        raise ConfigurationError(
+            f"[slam] start = {slam.start!r}: method {slam.method!r} cannot find its place in a map; "
+            "expected method = 'robust' or start = 'new'"
+        )
+    if slam.start == "continue" and not slam.map and not has_maps(path):
+        return None, None
+    return load_map(path, slam.map, clock_offset_ns)
+
+
+def has_maps(path: Path) -> bool:
+    """Whether a database is there and holds a map with keyframes. Raises as `open_database`."""
+    if not path.exists() or path.stat().st_size == 0:
+        return False
+    connection = open_database(path)
+    try:
+        return connection.execute("SELECT 1 FROM keyframes LIMIT 1").fetchone() is not None
+    finally:
+        connection.close()
 
 
 def _pose(data: bytes) -> FloatArray:

@@ -43,9 +43,16 @@ class RelocalisationSection(Section):
         0.6, "1", "share of touches on mapped ground for a contradiction to count", low=0.1, high=1.0
     )
     max_inliers_contradiction: float = parameter(
-        0.5, "1", "under this share of fitting touches the map contradicts the place", low=0.0, high=1.0
+        0.6, "1", "under this share of fitting touches the map contradicts the place", low=0.0, high=1.0
     )
     contradictions: int = parameter(
-        4, "1", "keyframes in a row that the map contradicts before the robot counts as carried away", low=2, high=50
+        2, "1", "keyframes that the map contradicts after a break, before the robot counts as carried away",
+        low=1, high=50,
+    )  # fmt: skip
+    patience: int = parameter(
+        12, "1", "keyframes after which a doubt that nothing has confirmed is dropped: ground changes", low=2, high=200
+    )
+    elsewhere: float = parameter(
+        0.25, "m", "a second opinion this far from where the robot is thought to be contradicts it", low=0.05, high=5.0
     )
     sigma_yaw_deg: float = parameter(25.0, "deg", "of a heading that the operator tells", low=1.0, high=180.0)

@@ -35,11 +35,11 @@ from robominer_slam.estimation.planar_motion import (
     VX,
     VY,
     WZ,
-    X,
-    Y,
     YAW,
     Inputs,
     PlanarFilter,
+    X,
+    Y,
     compose,
     compose_jacobian,
 )

@@ -64,6 +64,11 @@ class KeyframeMap:
         self.version += 1
 
     @property
+    def ids(self) -> list[int]:
+        """Of the keyframes, in the order of the poses."""
+        return [keyframe.id for keyframe in self.keyframes]
+
+    @property
     def closures(self) -> int:
         """Number of loop closures in the graph."""
         return sum(edge.kind == "loop" for edge in self.edges)

@@ -118,7 +118,7 @@ def search(
         N = _window(irfft2(n * grid.fft_known, s=grid.shape), reach)
         E = _window(irfft2(nzz * grid.fft_known - 2.0 * nz * grid.fft_height + n * grid.fft_square, s=grid.shape), reach)
         S = _window(irfft2(nz * grid.fft_known - n * grid.fft_height, s=grid.shape), reach)
-        enough = N >= least_overlap * len(points)
+        enough = least_overlap * len(points) <= N
         safe = np.where(enough, N, 1.0)
         costs[k] = np.where(enough, np.maximum(E - S * S / (safe + height_prior), 0.0) / safe, np.inf)
         overlaps[k] = N / len(points)

@@ -15,7 +15,7 @@ from robominer_slam.slam.keyframe import Keyframe
 from robominer_slam.slam.map_ground import MapGround
 from robominer_slam.slam.relocalisation import SessionKeyframe, carried, relative, thinned
 from robominer_slam.slam.robust import PLANAR
-from robominer_slam.slam.surface_registration import YAW, SurfaceMatch, Z, fit, placed
+from robominer_slam.slam.surface_registration import YAW, SurfaceMatch, fit, height_left_free, placed
 
 FloatArray = NDArray[np.float64]
 
@@ -87,8 +87,7 @@ class FrozenTracker:
 
     def _correct(self, match: SurfaceMatch) -> None:
         p = self._parameters.closure
-        H = match.information
-        planar = H[:3, :3] - np.outer(H[:3, Z], H[Z, :3]) / max(H[Z, Z], 1e-12)
+        planar = height_left_free(match.information)
         floor = np.diag(np.square([p.floor, p.floor, np.deg2rad(p.floor_yaw_deg)]))
         noise = p.inflation * np.linalg.inv(planar + np.eye(3) * 1e-3) + floor
         innovation = match.pose[:3] - self.pose[:3]

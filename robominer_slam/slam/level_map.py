@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,7 +117,7 @@ def _chain(known: LevelMap) -> list[LevelEdge]:
     links = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(ids), len(ids)))
     _, part = connected_components(links, directed=False)
     chain, seen = [], {part[0]}
-    for before, k in zip(ids, ids[1:], strict=False):
+    for before, k in pairwise(ids):
         if part[place[k]] in seen:
             continue
         seen.add(part[place[k]])

@@ -4,14 +4,13 @@ Until the place is known, the session has a graph of its own and the map stays a
 both are joined by the matches that told the place, and all that the session has touched enters the map at once;
 in a frozen map, only the pose follows (`frozen_tracking`).
 
-A robot that was carried away is noticed by two signs together: the ground under the whiskers ceased to be that of a
-moment ago (`Keyframe.breaks`), and the map contradicts several keyframes in a row. Keyframes under suspicion are
-held back, so that the map never gets them if the suspicion holds. Flooded or changed ground has only the second
-sign, and is no reason to give the place up.
+While there is doubt whether the robot was carried away (`doubts`), keyframes are held back, and the whole map is
+searched for what they touched: a second opinion. The map never gets them if the robot turns out to be elsewhere.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +20,7 @@ from robominer_slam import geometry
 from robominer_slam.configuration.robust_slam_section import RobustSlamSection
 from robominer_slam.slam.closure_search import Closure
 from robominer_slam.slam.composite_scan import voxel_filter
+from robominer_slam.slam.doubts import Doubts
 from robominer_slam.slam.frozen_tracking import FrozenTracker
 from robominer_slam.slam.keyframe import BackendResult, GraphEdge, Keyframe
 from robominer_slam.slam.level_map import LevelMap, from_saved
@@ -31,7 +31,7 @@ from robominer_slam.slam.robust import levelled
 from robominer_slam.slam.saved_map import SavedMap
 from robominer_slam.slam.session_backend import SessionBackend
 from robominer_slam.slam.surface import SurfaceModel
-from robominer_slam.slam.surface_registration import YAW, SurfaceMatch
+from robominer_slam.slam.surface_registration import YAW
 
 FloatArray = NDArray[np.float64]
 
@@ -58,10 +58,11 @@ class LocalisedBackend:
         self._held: list[Keyframe] = []
         self._T_map_odom = np.eye(4)
         self._version = 0
-        self._doubts = _Doubts(parameters)
+        self._doubts = Doubts(parameters.relocalisation)
         self._base = LevelMap()
         self._ground: MapGround | None = None
         self._relocaliser: Relocaliser | None = None
+        self._second_opinion: Relocaliser | None = None
         self._tracker: FrozenTracker | None = None
         self._poses, self._ids = np.zeros((0, 4, 4)), tuple[int, ...]()
         self._edges: tuple[GraphEdge, ...] = ()
@@ -93,10 +94,10 @@ class LocalisedBackend:
             self._ground = MapGround(base.touches(), self._model, self._parameters.point_voxel, p.cell, p.reach)
         self._base = base
         self._relocaliser = Relocaliser(p, self._ground, self._parameters.closure.inflation)
-        self._tracker = None
+        self._tracker = self._second_opinion = None
         self._session = SessionBackend(self._parameters)
         self._held = []
-        self._doubts = _Doubts(self._parameters)
+        self._doubts = Doubts(self._parameters.relocalisation)
         if prior is not None:
             self._relocaliser.expect(prior)
 
@@ -112,9 +113,11 @@ class LocalisedBackend:
         self._held.append(keyframe)
         assert self._relocaliser is not None
         place = self._relocaliser.add(self._session_keyframe(keyframe))
-        if place is None:
-            return self._unknown(keyframe)
-        ties = [self._tie(vote) for vote in self._relocaliser.agreeing]
+        return self._unknown(keyframe) if place is None else self._joined(keyframe, place, self._relocaliser)
+
+    def _joined(self, keyframe: Keyframe, place: Place, found_by: Relocaliser) -> BackendResult:
+        """The session, all of it held back so far, becomes part of the map."""
+        ties = [self._tie(vote, found_by) for vote in found_by.agreeing]
         own = self._session.pose(keyframe.id)
         origin = np.append(geometry.se2_compose(place.pose[:3], geometry.se2_inverse(own[:3])), place.pose[3] - own[3])
         self._session.adopt(self._base, origin, ties)
@@ -127,12 +130,11 @@ class LocalisedBackend:
             keyframe, self._T_map_odom, self._poses, UNKNOWN, self._edges, 0, self._version, (), self._ids, False
         )
 
-    def _tie(self, place: Place) -> Closure:
+    def _tie(self, place: Place, found_by: Relocaliser) -> Closure:
         """A place that was found, as a closure with the nearest keyframe of the map."""
-        assert self._relocaliser is not None
         anchor = self._base.nearest(place.pose[:2])
         p = self._parameters.closure
-        covariance = self._relocaliser.covariance(place.match)
+        covariance = found_by.covariance(place.match)
         assert covariance is not None
         covariance = covariance + np.diag(np.square([p.floor, p.floor, np.deg2rad(p.floor_yaw_deg)]))
         c, s = np.cos(place.pose[YAW]), np.sin(place.pose[YAW])
@@ -149,20 +151,55 @@ class LocalisedBackend:
     # -------------------------------------------------------------------------------------------------- mapping
 
     def _mapped(self, keyframe: Keyframe, result: BackendResult) -> BackendResult:
-        match = None if result.closures else self._session.look(keyframe, self._model)
-        self._doubts.judge(keyframe, match)
+        closed = result.closures > 0
+        self._doubts.judge(keyframe, None if closed else self._session.look(keyframe, self._model), closed)
         self._held.append(keyframe)
-        if self._doubts.carried_away:
-            held = self._held
-            self._search_in(self._session.level_map().without({k.id for k in held}), None)
-            for one in held:
-                self._session.process(one)
-                last = self._searched(one)
-            return last
-        if self._doubts.count:
-            return self._known(result, ())
+        if self._doubts.any:
+            return self._doubted(keyframe, result)
+        self._second_opinion, self._ground = None, None
         entered, self._held = tuple(self._held), []
         return self._known(result, entered)
+
+    def _doubted(self, keyframe: Keyframe, result: BackendResult) -> BackendResult:
+        base = self._session.level_map().without({k.id for k in self._held})
+        if not base.poses:
+            self._doubts.clear()
+            entered, self._held = tuple(self._held), []
+            return self._known(result, entered)
+        place = self._asked(base, self._held if self._second_opinion is None else [keyframe])
+        if place is not None and self._near(place.pose, self._session.pose(keyframe.id)):
+            self._doubts.clear()
+        elif place is not None or self._doubts.carried_away:
+            return self._carried_away(base, keyframe, place)
+        return replace(self._known(result, ()), localised=not self._doubts.serious)
+
+    def _asked(self, base: LevelMap, keyframes: Sequence[Keyframe]) -> Place | None:
+        """Where the whole map says that the newest keyframe is, if it is sure."""
+        p = self._parameters.relocalisation
+        if self._ground is None:
+            self._ground = MapGround(base.touches(), self._model, self._parameters.point_voxel, p.cell, p.reach)
+        if self._second_opinion is None:
+            self._second_opinion = Relocaliser(p, self._ground, self._parameters.closure.inflation)
+        place = None
+        for one in keyframes:
+            place = self._second_opinion.add(self._session_keyframe(one))
+        return place
+
+    def _carried_away(self, base: LevelMap, keyframe: Keyframe, place: Place | None) -> BackendResult:
+        """What is held back becomes a session of its own; the map ends before it."""
+        held, found_by = self._held, self._second_opinion
+        assert found_by is not None
+        self._base, self._relocaliser = base, found_by
+        self._second_opinion = None
+        self._session = SessionBackend(self._parameters)
+        self._doubts = Doubts(self._parameters.relocalisation)
+        for one in held:
+            self._session.process(one)
+        return self._unknown(keyframe) if place is None else self._joined(keyframe, place, found_by)
+
+    def _near(self, a: FloatArray, b: FloatArray) -> bool:
+        far = self._parameters.relocalisation.elsewhere
+        return bool(np.hypot(*(a[:2] - b[:2])) <= far) and abs(float(geometry.wrap_angle(a[YAW] - b[YAW]))) <= far
 
     def _known(self, result: BackendResult, entered: tuple[Keyframe, ...]) -> BackendResult:
         """A result of the session's graph, without the keyframes that are held back."""
@@ -183,19 +220,25 @@ class LocalisedBackend:
         taken = self._session_keyframe(keyframe)
         if self._tracker is None:
             assert self._relocaliser is not None
-            assert self._ground is not None
             place = self._relocaliser.add(taken)
             if place is None:
                 return self._unknown(keyframe)
-            covariance = self._relocaliser.covariance(place.match)
-            assert covariance is not None
-            self._tracker = FrozenTracker(self._parameters, self._ground, taken, place.pose, covariance)
-            self._relocaliser = None
+            self._track(taken, place, self._relocaliser)
         else:
             self._doubts.judge(keyframe, self._tracker.follow(keyframe, taken))
-            if self._doubts.carried_away:
-                self._search_in(self._base, None)
-                return self._followed(keyframe)
+            if not self._doubts.any:
+                self._second_opinion = None
+            else:
+                place = self._asked(self._base, [keyframe])
+                assert self._second_opinion is not None
+                if place is not None and not self._near(place.pose, self._tracker.pose):
+                    self._track(taken, place, self._second_opinion)
+                elif place is not None:
+                    self._doubts.clear()
+                elif self._doubts.carried_away:
+                    self._relocaliser, self._second_opinion, self._tracker = self._second_opinion, None, None
+                    return self._unknown(keyframe)
+        assert self._tracker is not None
         level, tilt = self._tracker.pose, levelled(keyframe.T_odom_base)[1]
         T = geometry.T_from_xyyaw(level[:3])
         T[2, 3] = level[3]
@@ -203,33 +246,13 @@ class LocalisedBackend:
         self._T_map_odom = geometry.normalise_pose(T @ geometry.inverse(keyframe.T_odom_base))
         return BackendResult(
             keyframe, self._T_map_odom, self._poses, self._tracker.covariance.copy(), self._edges, 0, self._version,
-            (), self._ids,
+            (), self._ids, not self._doubts.serious,
         )  # fmt: skip
 
-
-class _Doubts:
-    """Counts keyframes in a row that the map contradicts.
-
-    Attributes:
-        count: of them.
-    """
-
-    def __init__(self, parameters: RobustSlamSection) -> None:
-        self._parameters = parameters.relocalisation
-        self._breaks: list[int] = []
-        self._broken = False
-        self.count = 0
-
-    def judge(self, keyframe: Keyframe, match: SurfaceMatch | None) -> None:
-        """Take a keyframe and how it fits where it is thought to be; None where nothing is known there."""
-        p = self._parameters
-        # The break is noticed up to two keyframes after the first that was touched elsewhere, or before it.
-        self._breaks = [*self._breaks, keyframe.breaks][-(p.contradictions + 3) :]
-        if match is None or match.overlap < p.min_overlap_tracking:
-            return
-        self.count = self.count + 1 if match.inliers < p.max_inliers_contradiction else 0
-
-    @property
-    def carried_away(self) -> bool:
-        """Whether the robot cannot be where it is thought to be."""
-        return self.count >= self._parameters.contradictions and self._breaks[-1] > self._breaks[0]
+    def _track(self, keyframe: SessionKeyframe, place: Place, found_by: Relocaliser) -> None:
+        covariance = found_by.covariance(place.match)
+        assert covariance is not None
+        assert self._ground is not None
+        self._tracker = FrozenTracker(self._parameters, self._ground, keyframe, place.pose, covariance)
+        self._relocaliser, self._second_opinion = None, None
+        self._doubts = Doubts(self._parameters.relocalisation)

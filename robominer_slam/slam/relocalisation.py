@@ -24,7 +24,7 @@ from robominer_slam.configuration.relocalisation_section import RelocalisationSe
 from robominer_slam.slam.global_search import apart
 from robominer_slam.slam.map_ground import MapGround
 from robominer_slam.slam.place_prior import PlacePrior
-from robominer_slam.slam.surface_registration import YAW, SurfaceMatch, Z, fit, placed
+from robominer_slam.slam.surface_registration import YAW, SurfaceMatch, fit, height_left_free, placed
 
 FloatArray = NDArray[np.float64]
 
@@ -177,11 +177,10 @@ class Relocaliser:
 
     def covariance(self, match: SurfaceMatch) -> FloatArray | None:
         """Of x, y, yaw in map, shape (3, 3); None where the touches leave a direction free."""
-        H = match.information
-        planar = H[:3, :3] - np.outer(H[:3, Z], H[Z, :3]) / max(H[Z, Z], 1e-12)
+        planar = height_left_free(match.information)
         if np.linalg.eigvalsh(planar)[0] <= 1.0:
             return None
-        covariance: FloatArray = self._inflation * np.linalg.inv(planar)
+        covariance: FloatArray = np.asarray(self._inflation * np.linalg.inv(planar), dtype=np.float64)
         return covariance
 
     # ------------------------------------------------------------------------------------------------- agreement

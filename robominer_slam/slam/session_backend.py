@@ -77,7 +77,7 @@ class SessionBackend(RobustBackend):
         return self._result(keyframe, closures)
 
     def look(self, keyframe: Keyframe, model: SurfaceModel) -> SurfaceMatch | None:
-        """How the newest keyframe fits the ground touched long before it, where it is thought to be; None: no ground."""
+        """How the newest keyframe fits the ground touched long before, where it is thought to be; None without any."""
         graph, p = self._graph, self._parameters.closure
         k = keyframe.id
         points = self._patches[k].points
