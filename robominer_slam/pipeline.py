@@ -85,6 +85,7 @@ class Pipeline:
         self.localised = True
         self._prior: PlacePrior | None = None
         self._sought_from = -1
+        self._breaks = 0
         self._T_map_odom = np.eye(4)
         self._last_result: BackendResult | None = None
         self._odometry_at_result: FloatArray | None = None
@@ -214,8 +215,17 @@ class Pipeline:
             reckoning.correct_pose(stamp, correction.offset, correction.information)
             odometry = reckoning.state_at(stamp)
             level, _ = levelled(planar_pose(odometry))
+        if scans.breaks > self._breaks:
+            self._broken(scans.breaks)
         scans.add(level, points)
         return odometry
+
+    def _broken(self, breaks: int) -> None:
+        """The ground is not that of a moment ago: the place counts as unknown until the back-end has judged it."""
+        self._breaks = breaks
+        if self._composite is not None and self.runner is not None:
+            self._composite.restart()
+            self.localised, self._sought_from = False, self._composite.next_id
 
     def _keyframe(
         self, stamp: int, T_odom_base: FloatArray, points: FloatArray, odometry: OdometryState

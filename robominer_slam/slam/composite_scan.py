@@ -84,6 +84,11 @@ class CompositeScan:
         self._next_id += 1
         return keyframe
 
+    @property
+    def next_id(self) -> int:
+        """Of the next keyframe."""
+        return self._next_id
+
     def restart(self) -> None:
         """Forget the scans since the last keyframe: the robot has been carried."""
         self._scans, self._count = [], 0

@@ -151,9 +151,12 @@ class LocalisedBackend:
     # -------------------------------------------------------------------------------------------------- mapping
 
     def _mapped(self, keyframe: Keyframe, result: BackendResult) -> BackendResult:
-        closed = result.closures > 0
-        self._doubts.judge(keyframe, None if closed else self._session.look(keyframe, self._model), closed)
+        self._doubts.notice(keyframe)
         self._held.append(keyframe)
+        closed = result.closures > 0
+        # After a break, what was touched before it is what the robot may have left.
+        recent = {k.id for k in self._held} if self._doubts.broken else None
+        self._doubts.judge(None if closed else self._session.look(keyframe, self._model, recent), closed)
         if self._doubts.any:
             return self._doubted(keyframe, result)
         self._second_opinion, self._ground = None, None
@@ -171,7 +174,7 @@ class LocalisedBackend:
             self._doubts.clear()
         elif place is not None or self._doubts.carried_away:
             return self._carried_away(base, keyframe, place)
-        return replace(self._known(result, ()), localised=not self._doubts.serious)
+        return replace(self._known(result, ()), localised=not self._doubts.broken)
 
     def _asked(self, base: LevelMap, keyframes: Sequence[Keyframe]) -> Place | None:
         """Where the whole map says that the newest keyframe is, if it is sure."""
@@ -225,7 +228,8 @@ class LocalisedBackend:
                 return self._unknown(keyframe)
             self._track(taken, place, self._relocaliser)
         else:
-            self._doubts.judge(keyframe, self._tracker.follow(keyframe, taken))
+            self._doubts.notice(keyframe)
+            self._doubts.judge(self._tracker.follow(keyframe, taken))
             if not self._doubts.any:
                 self._second_opinion = None
             else:
@@ -246,7 +250,7 @@ class LocalisedBackend:
         self._T_map_odom = geometry.normalise_pose(T @ geometry.inverse(keyframe.T_odom_base))
         return BackendResult(
             keyframe, self._T_map_odom, self._poses, self._tracker.covariance.copy(), self._edges, 0, self._version,
-            (), self._ids, not self._doubts.serious,
+            (), self._ids, not self._doubts.broken,
         )  # fmt: skip
 
     def _track(self, keyframe: SessionKeyframe, place: Place, found_by: Relocaliser) -> None:

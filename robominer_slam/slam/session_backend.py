@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -76,14 +76,22 @@ class SessionBackend(RobustBackend):
         """The result as it is now, of the newest keyframe."""
         return self._result(keyframe, closures)
 
-    def look(self, keyframe: Keyframe, model: SurfaceModel) -> SurfaceMatch | None:
-        """How the newest keyframe fits the ground touched long before, where it is thought to be; None without any."""
+    def look(
+        self, keyframe: Keyframe, model: SurfaceModel, recent: Collection[int] | None = None
+    ) -> SurfaceMatch | None:
+        """How the newest keyframe fits the ground touched before, where it is thought to be; None without any.
+
+        Args:
+            keyframe: the newest.
+            model: how touches make a surface.
+            recent: ids of keyframes whose ground does not count; None for those of the closures' least travel.
+        """
         graph, p = self._graph, self._parameters.closure
         k = keyframe.id
         points = self._patches[k].points
         old = [
             i for i, patch in self._patches.items()
-            if patch.travelled <= keyframe.travelled - p.min_travel
+            if (patch.travelled <= keyframe.travelled - p.min_travel if recent is None else i not in recent)
             and np.hypot(*(graph.poses[i][:2] - graph.poses[k][:2])) <= p.target_radius
         ]  # fmt: skip
         if not old or len(points) < LOOK_POINTS // 4:
