@@ -41,6 +41,7 @@ test: lint types
 
 bench: $(VENV)/.dev
 	$(BIN)/python benchmarks/pose_graph.py
+	$(BIN)/python -m benchmarks.thesis_table --jobs 2 --report out/thesis-table.html
 
 soak: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.soak_hotplug

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import replace
@@ -291,11 +292,18 @@ class Pipeline:
             sample,
             gyro=None if sample.gyro is None else R @ sample.gyro,
             acceleration=None if sample.acceleration is None else R @ sample.acceleration,
+            orientation_xyzw=None if sample.orientation_xyzw is None else _turned(sample.orientation_xyzw, R),
         )
+
+
+def _turned(xyzw: FloatArray, R_base_imu: FloatArray) -> FloatArray:
+    """Attitude of base_link from that of an IMU mounted in it."""
+    return geometry.matrix_to_quaternion(geometry.quaternion_to_matrix(xyzw) @ R_base_imu.T)
 
 
 def planar_pose(state: OdometryState) -> FloatArray:
     """Pose of base_link in odom, shape (4, 4): in space where it is known so, else in the plane."""
     if state.T_odom_base is not None:
         return state.T_odom_base
-    return geometry.T_from_xyyaw([state.x, state.y, state.yaw])
+    c, s = math.cos(state.yaw), math.sin(state.yaw)
+    return np.array([[c, -s, 0.0, state.x], [s, c, 0.0, state.y], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])

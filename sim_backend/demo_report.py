@@ -8,9 +8,10 @@ from pathlib import Path
 import click
 import numpy as np
 
-from robominer_slam.cli.evaluate import print_report, read_tum
+from robominer_slam.cli.evaluate import print_report
 from robominer_slam.evaluation.figures import DriveData, write_figures
 from robominer_slam.evaluation.report import drive_report
+from robominer_slam.evaluation.trajectory_files import read_tum
 from robominer_slam.mapping.height_grid import height_grid
 from sim_backend.process_usage import ProcessUsage
 

@@ -10,34 +10,12 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from drivers.recording_reader import Recording
-from robominer_slam import geometry
+from robominer_slam.cli.evaluate_runs import report, run
 from robominer_slam.evaluation.report import ERROR_COLUMNS, DriveReport, drive_report, report_rows
-from robominer_slam.evaluation.trajectory import Trajectory, TrajectoryError, parse_tum
+from robominer_slam.evaluation.trajectory_files import read_tum, truth_of
 from robominer_slam.mapping.height_grid import height_grid
 
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
-
-
-def read_tum(path: Path) -> Trajectory:
-    """Read a TUM trajectory; raises TrajectoryError."""
-    with path.open(encoding="utf-8") as file:
-        return parse_tum(file, str(path))
-
-
-def truth_of(path: Path) -> Trajectory:
-    """Ground truth of a recording (.mcap) or of a TUM file.
-
-    Raises:
-        RecordingError, TrajectoryError: it cannot be read, or has no ground truth.
-    """
-    if path.suffix != ".mcap":
-        return read_tum(path)
-    truths = [truth for _, truth in Recording(path).ground_truth()]
-    if not truths:
-        raise TrajectoryError(f"{path}: no ground truth in this recording")
-    stamps = np.array([truth.stamp_ns for truth in truths], dtype=np.int64)
-    return Trajectory(stamps, geometry.from_vector7(np.array([truth.pose for truth in truths])))
 
 
 def print_report(report: DriveReport, title: str) -> None:
@@ -54,21 +32,43 @@ def print_report(report: DriveReport, title: str) -> None:
         console.print(f"{name:>40}: {value}", highlight=False)
 
 
-@click.command(epilog="Example: robominer-slam evaluate --truth drive.mcap --odometry odometry.tum --slam slam.tum")
-@click.option("--truth", type=FILE, required=True, help="Ground truth: TUM format, or the recording.")
-@click.option("--odometry", type=FILE, required=True, help="Dead reckoning alone, TUM format.")
-@click.option("--slam", type=FILE, required=True, help="Poses as published, TUM format.")
+@click.group(
+    invoke_without_command=True,
+    epilog="Example: robominer-slam evaluate --truth drive.mcap --odometry odometry.tum --slam slam.tum",
+)
+@click.option("--truth", type=FILE, help="Ground truth: TUM format, or the recording.")
+@click.option("--odometry", type=FILE, help="Dead reckoning alone, TUM format.")
+@click.option("--slam", type=FILE, help="Poses as published, TUM format.")
 @click.option("--graph", "graph_file", type=FILE, help="Pose graph, the JSON of map/graph.")
 @click.option("--figure", type=click.Path(dir_okay=False, path_type=Path), help="Path figure to write (PNG).")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@click.pass_context
 def evaluate(
-    truth: Path, odometry: Path, slam: Path, graph_file: Path | None, figure: Path | None, as_json: bool
+    context: click.Context,
+    truth: Path | None,
+    odometry: Path | None,
+    slam: Path | None,
+    graph_file: Path | None,
+    figure: Path | None,
+    as_json: bool,
 ) -> None:
-    """Errors of odometry and SLAM against ground truth, frame by frame, without alignment."""
+    """Errors of odometry and SLAM against ground truth, frame by frame, without alignment.
+
+    With the options below for one drive whose trajectories are there; with `run` for recordings that are to be
+    replayed with several methods; with `report` for saved results of `run`.
+    """
+    if context.invoked_subcommand is not None:
+        if as_json or any((truth, odometry, slam, graph_file, figure)):
+            raise click.UsageError(f"Options go behind '{context.invoked_subcommand}'.")
+        return
+    if truth is None or odometry is None or slam is None:
+        given = {"--truth": truth, "--odometry": odometry, "--slam": slam}
+        missing = next(option for option, value in given.items() if value is None)
+        raise click.UsageError(f"Missing option '{missing}'.")
     trajectories = {"truth": truth_of(truth), "odom": read_tum(odometry), "slam": read_tum(slam)}
     graph = json.loads(graph_file.read_text(encoding="utf-8")) if graph_file else {"keyframes": [], "edges": []}
     try:
-        report = drive_report(trajectories["slam"], trajectories["odom"], trajectories["truth"], graph)
+        errors = drive_report(trajectories["slam"], trajectories["odom"], trajectories["truth"], graph)
     except ValueError as error:
         raise click.UsageError(str(error)) from error
     if figure is not None:
@@ -76,8 +76,12 @@ def evaluate(
 
         empty = height_grid(np.zeros((0, 3)), 1.0)
         order = (trajectories["truth"], trajectories["odom"], trajectories["slam"])
-        path_figure(figure, DriveData(*order, graph, empty, report), slam.stem)
+        path_figure(figure, DriveData(*order, graph, empty, errors), slam.stem)
     if as_json:
-        click.echo(json.dumps(report.as_dict()))
+        click.echo(json.dumps(errors.as_dict()))
     else:
-        print_report(report, slam.stem)
+        print_report(errors, slam.stem)
+
+
+evaluate.add_command(run)
+evaluate.add_command(report)

@@ -16,6 +16,7 @@ from drivers.port_discovery import PortNameError
 from drivers.recording_reader import RecordingError
 from robominer_slam import __version__
 from robominer_slam.configuration.file import ConfigurationError
+from robominer_slam.evaluation.run_record import ResultsError
 from robominer_slam.evaluation.trajectory import TrajectoryError
 from robominer_slam.layout import LayoutError
 from robominer_slam.publishing.zenoh_session import ZenohSetupError
@@ -30,6 +31,7 @@ USER_ERRORS = (
     LayoutError,
     PortNameError,
     RecordingError,
+    ResultsError,
     StoreError,
     TrajectoryError,
     ZenohSetupError,

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import difflib
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import tomlkit
 from pydantic import BaseModel, ValidationError
@@ -41,6 +42,11 @@ def parse(text: str, where: str) -> Configuration:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigurationError(f"{where}: not TOML: {error}") from error
+    return validate(data, where)
+
+
+def validate(data: Mapping[str, Any], where: str) -> Configuration:
+    """A configuration from its keys; `where` names it in messages. Raises as `load`."""
     try:
         return Configuration.model_validate(data)
     except ValidationError as error:

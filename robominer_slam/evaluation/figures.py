@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from robominer_slam.evaluation.pose_graph_errors import LEAST_WEIGHT
 from robominer_slam.evaluation.report import DriveReport
 from robominer_slam.evaluation.trajectory import Trajectory
 from robominer_slam.mapping.height_grid import HeightGrid
@@ -24,6 +26,8 @@ FloatArray = NDArray[np.float64]
 
 #: Okabe and Ito's palette.
 TRUTH, ODOMETRY, SLAM, CLOSURE, WRONG = "#000000", "#E69F00", "#0072B2", "#009E73", "#D55E00"
+#: Closures that the robust kernel has switched off.
+UNUSED = "#999999"
 DPI = 130
 WIDTH_IN = 9.0
 #: A straight drive still gets this much room across it, m.
@@ -33,6 +37,8 @@ MARGIN_M = 0.15
 ARC_M = 0.25
 #: Room for the legend between axes and title, points.
 TITLE_PAD = 36.0
+#: What a line of a legend has room for, and what each entry takes beside its text.
+CHARACTERS_PER_INCH, SYMBOL_CHARACTERS = 13.6, 7
 
 
 @dataclass(frozen=True)
@@ -56,31 +62,53 @@ def draw_path(axes: Axes, data: DriveData) -> None:
     ):
         axes.plot(trajectory.T[:, 0, 3], trajectory.T[:, 1, 3], style, color=colour, linewidth=width, label=label)
     axes.plot(*data.truth.T[0, :2, 3], "o", color=TRUTH, markersize=6, label="start")
-    _plan(axes)
+    plan_axes(axes)
 
 
 def draw_height_map(figure: Figure, axes: Axes, data: DriveData) -> None:
     """Mean height of the touches per cell; white where nothing was touched."""
-    ny, nx = data.grid.height.shape
-    x0, y0 = data.grid.origin
-    extent = (x0, x0 + nx * data.grid.cell, y0, y0 + ny * data.grid.cell)
-    image = axes.imshow(data.grid.height, origin="lower", extent=extent, cmap="viridis", interpolation="nearest")
-    figure.colorbar(image, ax=axes, label="height in map (m)", shrink=0.9)
-    _plan(axes, "box")
+    height_plan(figure, axes, data.grid)
+
+
+def height_plan(figure: Figure, axes: Axes, grid: HeightGrid, limits: tuple[float, float] | None = None) -> None:
+    """Heights of a grid, m, white where nothing was touched; `limits` of the colours, by default the grid's own."""
+    ny, nx = grid.height.shape
+    x0, y0 = grid.origin
+    extent = (x0, x0 + nx * grid.cell, y0, y0 + ny * grid.cell)
+    low, high = limits if limits is not None else (None, None)
+    image = axes.imshow(
+        grid.height, origin="lower", extent=extent, cmap="viridis", interpolation="nearest", vmin=low, vmax=high
+    )
+    plan_axes(axes, "box")
+    axes.grid(visible=False)
+    # Beside the axes and as high as they are, whatever their aspect.
+    figure.colorbar(image, cax=axes.inset_axes((1.02, 0.0, 0.03, 1.0)), label="height in map (m)")
 
 
 def draw_pose_graph(axes: Axes, data: DriveData) -> None:
     """Keyframes, odometry edges, and loop closures as arcs, the wrong ones apart."""
-    axes.plot(data.truth.T[:, 0, 3], data.truth.T[:, 1, 3], color="#bbbbbb", linewidth=3.0, label="ground truth")
-    position = {int(k["id"]): np.array(k["pose"][:2]) for k in data.graph["keyframes"]}
-    edges = data.graph["edges"]
-    odometry = [e for e in edges if e["kind"] == "odometry"]
-    loops = [e for e in edges if e["kind"] == "loop"]
-    wrong = data.report.closures.wrong
+    graph_plan(axes, data.truth, data.graph, data.report.closures.wrong)
+
+
+def graph_plan(axes: Axes, truth: Trajectory, graph: Mapping[str, Any], wrong: NDArray[np.bool_]) -> None:
+    """The true path, keyframes, odometry edges, and loop closures as arcs.
+
+    Args:
+        axes: where.
+        truth: the true path.
+        graph: as `map/graph` has it.
+        wrong: which of its loop closures are wrong, in their order, shape (n,).
+    """
+    axes.plot(truth.T[:, 0, 3], truth.T[:, 1, 3], color="#bbbbbb", linewidth=3.0, label="ground truth")
+    position = {int(k["id"]): np.array(k["pose"][:2]) for k in graph["keyframes"]}
+    odometry = [e for e in graph["edges"] if e["kind"] == "odometry"]
+    loops = [e for e in graph["edges"] if e["kind"] == "loop"]
+    judged = list(zip(loops, wrong, strict=True))
     groups: list[tuple[list[Any], str, str, float]] = [
         (odometry, SLAM, "odometry edges", 0.0),
-        ([e for e, bad in zip(loops, wrong, strict=True) if not bad], CLOSURE, "loop closures, right", ARC_M),
-        ([e for e, bad in zip(loops, wrong, strict=True) if bad], WRONG, "loop closures, wrong", ARC_M),
+        ([e for e, _ in judged if e["weight"] <= LEAST_WEIGHT], UNUSED, "closures without weight", ARC_M),
+        ([e for e, bad in judged if not bad and e["weight"] > LEAST_WEIGHT], CLOSURE, "closures, right", ARC_M),
+        ([e for e, bad in judged if bad and e["weight"] > LEAST_WEIGHT], WRONG, "closures, wrong", ARC_M),
     ]
     for group, colour, label, height in groups:
         lines = [_arc(position[int(e["i"])], position[int(e["j"])], height) for e in group]
@@ -90,7 +118,7 @@ def draw_pose_graph(axes: Axes, data: DriveData) -> None:
     if position:
         nodes = np.array(list(position.values()))
         axes.plot(nodes[:, 0], nodes[:, 1], ".", color=SLAM, markersize=5, label=f"keyframes ({len(nodes)})")
-    _plan(axes)
+    plan_axes(axes)
 
 
 def draw_errors(axes: Axes, data: DriveData) -> None:
@@ -114,7 +142,7 @@ def write_figures(folder: Path, data: DriveData, title: str) -> list[Path]:
     for name, draw in (("path", draw_path), ("pose_graph", draw_pose_graph)):
         figure, axes = plt.subplots(figsize=(WIDTH_IN, height), layout="constrained")
         draw(axes, data)
-        _legend(axes)
+        legend_above(axes)
         axes.set_title(f"{name.replace('_', ' ').capitalize()}, {title}", pad=TITLE_PAD)
         written.append(_save(figure, folder / f"{name}.png"))
     figure, axes = plt.subplots(figsize=(WIDTH_IN, height), layout="constrained")
@@ -130,7 +158,7 @@ def write_figures(folder: Path, data: DriveData, title: str) -> list[Path]:
     draw_pose_graph(rows[2], data)
     draw_errors(rows[3], data)
     for axes in rows[1:]:
-        _legend(axes)
+        legend_above(axes)
     written.append(_save(figure, folder / "overview.png"))
     return written
 
@@ -139,12 +167,13 @@ def path_figure(path: Path, data: DriveData, title: str) -> None:
     """The path alone."""
     figure, axes = plt.subplots(figsize=(WIDTH_IN, _plan_height(data)), layout="constrained")
     draw_path(axes, data)
-    _legend(axes)
+    legend_above(axes)
     axes.set_title(title, pad=TITLE_PAD)
     _save(figure, path)
 
 
-def _plan(axes: Axes, adjustable: Literal["box", "datalim"] = "datalim") -> None:
+def plan_axes(axes: Axes, adjustable: Literal["box", "datalim"] = "datalim") -> None:
+    """Equal axes in metres of map."""
     # The box of a path stays as it was laid out, its limits give way; the map's limits are the map's.
     axes.set_aspect("equal", adjustable=adjustable)
     axes.set_xlabel("x in map (m)")
@@ -166,15 +195,26 @@ def _plan_height(data: DriveData) -> float:
 
 
 def _arc(start: FloatArray, end: FloatArray, height: float) -> FloatArray:
-    """A parabola between two points, shape (m, 2), ended by NaN so that many draw as one line."""
+    """A parabola between two points, shape (m, 2), ended by NaN so that many draw as one line.
+
+    It is no higher than half of their distance: a closure between near keyframes is no spike.
+    """
+    height = min(height, 0.5 * float(np.linalg.norm(end - start)))
     share = np.linspace(0.0, 1.0, 12 if height else 2)[:, None]
     line = start + share * (end - start)
     line[:, 1:] += 4.0 * height * share * (1.0 - share)
     return np.concatenate([line, np.full((1, 2), np.nan)])
 
 
-def _legend(axes: Axes) -> None:
-    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, fontsize="small", frameon=False)
+def legend_above(axes: Axes, handles: Sequence[Artist] | None = None) -> None:
+    """The legend outside the axes, where it covers nothing; of the labelled artists, or of `handles`."""
+    shown = axes.get_legend_handles_labels()[0] if handles is None else list(handles)
+    longest = max((len(str(one.get_label())) for one in shown), default=0)
+    room = CHARACTERS_PER_INCH * axes.figure.bbox.width / axes.figure.dpi
+    columns = min(len(shown), max(1, int(room) // (longest + SYMBOL_CHARACTERS)), 4)
+    axes.legend(
+        handles=shown, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=columns, fontsize="small", frameon=False
+    )
 
 
 def _save(figure: Figure, path: Path) -> Path:

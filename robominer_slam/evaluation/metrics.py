@@ -51,15 +51,23 @@ class TrajectoryErrors:
     Attributes:
         stamps_ns: shape (n,).
         components: estimate minus truth: x, y, z (m) in map; roll, pitch, yaw (rad); shape (n, 6).
+        rotation: angle of the rotation between estimate and truth, shape (n,), rad.
     """
 
     stamps_ns: NDArray[np.int64]
     components: FloatArray
+    rotation: FloatArray
 
     @property
     def position(self) -> FloatArray:
         """Distance in x and y, shape (n,), m."""
         distance: FloatArray = np.hypot(self.components[:, 0], self.components[:, 1])
+        return distance
+
+    @property
+    def distance(self) -> FloatArray:
+        """Distance in x, y and z, shape (n,), m."""
+        distance: FloatArray = np.linalg.norm(self.components[:, :3], axis=1)
         return distance
 
     @property
@@ -85,4 +93,30 @@ def trajectory_errors(estimate: Trajectory, truth: Trajectory) -> TrajectoryErro
     inside, T_truth = interpolate(truth, estimate.stamps_ns)
     if not inside.any():
         raise ValueError("the estimate and the truth do not overlap in time: are their clocks the same?")
-    return TrajectoryErrors(estimate.stamps_ns[inside], component_errors(estimate.T[inside], T_truth))
+    T = estimate.T[inside]
+    return TrajectoryErrors(estimate.stamps_ns[inside], component_errors(T, T_truth), rotation_angle(T_truth, T))
+
+
+def rotation_angle(T_a: FloatArray, T_b: FloatArray) -> FloatArray:
+    """Angle of the rotation from a to b, shape (...,), rad, of poses (..., 4, 4)."""
+    return np.asarray(np.linalg.norm(geometry.se3_log(geometry.inverse(T_a) @ T_b)[..., 3:], axis=-1))
+
+
+def relative_errors(estimate: Trajectory, truth: Trajectory, frames: int) -> tuple[FloatArray, FloatArray]:
+    """How far the estimate drifts within so many frames, from every frame on: independent of errors before.
+
+    Args:
+        estimate: what is judged.
+        truth: interpolated at the estimate's times.
+        frames: from one pose to the other.
+
+    Returns:
+        Distances, m, and angles, rad, of the error of the relative pose; shape (n - frames,) each, empty where the
+        estimate has fewer frames.
+    """
+    inside, T_truth = interpolate(truth, estimate.stamps_ns)
+    T = estimate.T[inside]
+    moved = geometry.inverse(T[:-frames]) @ T[frames:]
+    truly = geometry.inverse(T_truth[:-frames]) @ T_truth[frames:]
+    error = geometry.inverse(truly) @ moved
+    return np.linalg.norm(error[:, :3, 3], axis=1), rotation_angle(truly, moved)

@@ -17,6 +17,8 @@ FloatArray = NDArray[np.float64]
 #: A closure is wrong if its T_i_j differs from the truth by more than either.
 WRONG_DISTANCE_M = 0.10
 WRONG_ANGLE_RAD = np.deg2rad(5.0)
+#: A closure that the robust kernel leaves no more than this has no say.
+LEAST_WEIGHT = 0.1
 
 
 @dataclass(frozen=True, slots=True)

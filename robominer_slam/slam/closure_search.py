@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from robominer_slam import geometry
 from robominer_slam.configuration.robust_slam_section import ClosureSection
-from robominer_slam.slam.correlative_search import SearchGrid, grid_around, search
+from robominer_slam.slam.correlative_search import SAME_ANGLE, SAME_DISTANCE, SearchGrid, grid_around, search
 from robominer_slam.slam.surface import Surface, SurfaceModel
 from robominer_slam.slam.surface_registration import YAW, SurfaceMatch, X, Y, Z, fit, height_left_free, placed
 
@@ -26,6 +26,8 @@ FloatArray = NDArray[np.float64]
 HEIGHT_SIGMA = 0.01
 #: Times that planes are looked up anew in the refinement.
 ASSOCIATIONS = 3
+#: Places of a search that are refined and compared.
+ALTERNATIVES = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +115,7 @@ class ClosureSearch:
         dz: float,
         prediction: FloatArray,
         covariance: FloatArray,
+        patch_covariance: FloatArray,
         anchor: int,
     ) -> Closure | None:
         """Search one pass; None if nothing overlaps enough.
@@ -125,6 +128,7 @@ class ClosureSearch:
             dz: predicted height of the new keyframe over the anchor, m.
             prediction: pose of the new keyframe in the anchor, shape (3,).
             covariance: of it, as a twist in the new keyframe's frame, shape (3, 3).
+            patch_covariance: of the source's touches as a whole against its newest, likewise.
             anchor: the target's frame: one of `targets`.
         """
         parameters = self._parameters
@@ -153,15 +157,22 @@ class ClosureSearch:
             np.deg2rad(parameters.yaw_step_deg),
             parameters.min_overlap,
             (self._model.touch_sigma / HEIGHT_SIGMA) ** 2 * 10.0,
+            ALTERNATIVES,
         )
         if not len(found.poses):
             return None
-        unique = float(found.cost[1] / max(found.cost[0], 1e-12)) if len(found.cost) > 1 else np.inf
+        match, unique = self._refined(Surface(target, self._model), points, found.poses)
+        return self._judged(match, unique, prediction, prior, R @ patch_covariance @ R.T, half, new, anchor, dz)
+
+    def _refined(self, surface: Surface, points: FloatArray, places: FloatArray) -> tuple[SurfaceMatch, float]:
+        """The best of the places after refinement, and by how much the next best that is another costs more."""
         height_prior = np.zeros((4, 4))
         height_prior[Z, Z] = 1.0 / HEIGHT_SIGMA**2
-        guess = np.append(found.poses[0], 0.0)
-        match = fit(Surface(target, self._model), points, guess, height_prior, ASSOCIATIONS)
-        return self._judged(match, unique, prediction, prior, half, new, anchor, dz)
+        matches = [fit(surface, points, np.append(place, 0.0), height_prior, ASSOCIATIONS) for place in places]
+        enough = [m for m in matches if m.overlap >= self._parameters.min_overlap] or matches
+        best = min(enough, key=lambda m: m.cost)
+        others = [m.cost for m in enough if not _same(m.pose, best.pose)]
+        return best, min(others, default=np.inf) / max(best.cost, 1e-12)
 
     def _window(self, prior: FloatArray) -> FloatArray:
         """Half size of the search in x, y and heading."""
@@ -177,6 +188,7 @@ class ClosureSearch:
         unique: float,
         prediction: FloatArray,
         prior: FloatArray,
+        patch: FloatArray,
         half: FloatArray,
         new: int,
         anchor: int,
@@ -185,7 +197,8 @@ class ClosureSearch:
         p = self._parameters
         planar = height_left_free(match.information)
         floor = np.square([p.floor, p.floor, np.deg2rad(p.floor_yaw_deg)])
-        covariance = p.inflation * np.linalg.inv(planar + np.eye(3)) + np.diag(floor)
+        quality = (match.rms / self._model.touch_sigma) ** 2
+        covariance = p.inflation * quality * np.linalg.inv(planar + np.eye(3)) + np.diag(floor) + patch
         least = np.linalg.eigvalsh(planar)[0]
         off = match.pose[:3] - prediction
         off[YAW] = geometry.wrap_angle(off[YAW])
@@ -195,6 +208,7 @@ class ClosureSearch:
             and match.inliers >= p.min_inliers
             and match.relief >= p.min_contrast * match.rms
             and unique >= p.uniqueness
+            and moved <= p.max_moved
             and least > 0.0
             and float(np.linalg.eigvalsh(covariance[:2, :2])[-1]) <= p.max_sigma**2
             and covariance[YAW, YAW] <= np.deg2rad(p.max_sigma_yaw_deg) ** 2
@@ -213,6 +227,12 @@ class ClosureSearch:
             moved,
             good,
         )
+
+
+def _same(a: FloatArray, b: FloatArray) -> bool:
+    """Whether two poses are the same place."""
+    near = np.hypot(a[X] - b[X], a[Y] - b[Y]) <= SAME_DISTANCE
+    return bool(near and abs(geometry.wrap_angle(a[YAW] - b[YAW])) <= SAME_ANGLE)
 
 
 def _thinned(points: FloatArray, count: int) -> FloatArray:

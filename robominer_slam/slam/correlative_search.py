@@ -116,7 +116,9 @@ def search(
         at = xy + centre[:2] - grid.origin
         n, nz, nzz = _transformed(at, z, grid.shape, grid.cell)
         N = _window(irfft2(n * grid.fft_known, s=grid.shape), reach)
-        E = _window(irfft2(nzz * grid.fft_known - 2.0 * nz * grid.fft_height + n * grid.fft_square, s=grid.shape), reach)
+        E = _window(
+            irfft2(nzz * grid.fft_known - 2.0 * nz * grid.fft_height + n * grid.fft_square, s=grid.shape), reach
+        )
         S = _window(irfft2(nz * grid.fft_known - n * grid.fft_height, s=grid.shape), reach)
         enough = least_overlap * len(points) <= N
         safe = np.where(enough, N, 1.0)

@@ -111,9 +111,7 @@ class KeyframeGraph:
         ids, problem, system, kernels = self._problem()
         place = {k: n for n, k in enumerate(ids)}
         poses = np.array([self.poses[k] for k in ids])
-        return pose_graph_bias.joint_covariance(
-            problem, kernels, poses, self.bias, system, [place[k] for k in nodes]
-        )
+        return pose_graph_bias.joint_covariance(problem, kernels, poses, self.bias, system, [place[k] for k in nodes])
 
     def relative_covariance(self, i: int, j: int) -> FloatArray:
         """Covariance of `relative(i, j)` as a twist in the frame of j, shape (3, 3)."""

@@ -158,9 +158,7 @@ def joint_covariance(
     return np.asarray(0.5 * (covariance + covariance.T))
 
 
-def _evaluate(
-    problem: BiasProblem, kernels: Kernels, poses: FloatArray, bias: FloatArray
-) -> tuple[EdgeCosts, float]:
+def _evaluate(problem: BiasProblem, kernels: Kernels, poses: FloatArray, bias: FloatArray) -> tuple[EdgeCosts, float]:
     costs = edge_costs(problem.edges(bias), kernels, poses, "gtsam")
     off = bias - problem.prior
     return costs, costs.cost + float(off @ problem.prior_information @ off)

@@ -32,6 +32,8 @@ LEAST_POINTS = 60
 HEIGHT_WALK = 0.002
 HEIGHT_SIGMA = 0.003
 TILT_SIGMA = 0.005
+#: A patch as a whole is about its middle: of the drift from its oldest to its newest keyframe it has half.
+PATCH_SHARE = 0.5
 
 
 class RobustBackend:
@@ -102,17 +104,18 @@ class RobustBackend:
             motion.bias[:nb],
         )
         graph.edges.append(edge)
-        if graph.bias.size != nb:
-            graph.bias = motion.bias_posterior[:nb].copy()
-        graph.bias_prior = motion.bias_posterior[:nb]
+        posterior = motion.bias_posterior[:nb]
+        # What the loops have taught of the biases stays; what the odometry has learned since is added.
+        graph.bias = graph.bias + (posterior - graph.bias_prior) if graph.bias.size == nb else posterior.copy()
+        graph.bias_prior = posterior
         graph.bias_prior_information = np.linalg.inv(motion.bias_covariance[:nb, :nb] + 1e-14 * np.eye(nb))
         step = geometry.se2_exp(edge.jacobian @ (graph.bias - edge.reference))
         graph.poses[k] = geometry.se2_compose(graph.poses[self._last.id], geometry.se2_compose(Z, step))
         graph.heights[k] = graph.heights[self._last.id] + dz
 
-    def _source(self, keyframe: Keyframe) -> FloatArray:
-        """Touches of the last keyframes, in the level frame of the newest."""
-        parts = []
+    def _source(self, keyframe: Keyframe) -> tuple[FloatArray, int]:
+        """Touches of the last keyframes, in the level frame of the newest, and the id of the oldest."""
+        parts, oldest = [], keyframe.id
         for k in range(keyframe.id, -1, -1):
             patch = self._patches.get(k)
             if patch is None or keyframe.travelled - patch.travelled >= self._parameters.closure.patch:
@@ -120,13 +123,14 @@ class RobustBackend:
             pose = self._graph.relative(keyframe.id, k)
             dz = self._graph.heights[k] - self._graph.heights[keyframe.id]
             parts.append(placed(patch.points, np.append(pose, dz)))
-        return np.concatenate(parts)
+            oldest = k
+        return np.concatenate(parts), oldest
 
     # --------------------------------------------------------------------------------------------- closures
 
     def _found(self, keyframe: Keyframe) -> list[Closure]:
         """Closures of a keyframe that pass every check of their own."""
-        source = self._source(keyframe)
+        source, oldest = self._source(keyframe)
         if len(source) < LEAST_POINTS:
             return []
         k, graph = keyframe.id, self._graph
@@ -145,6 +149,7 @@ class RobustBackend:
                 graph.heights[k] - graph.heights[anchor],
                 graph.relative(anchor, k),
                 covariance,
+                PATCH_SHARE * self._between(oldest, k),
                 anchor,
             )
             if closure is not None:

@@ -27,6 +27,8 @@ X, Y, YAW, Z = range(4)
 REWEIGHTINGS = 3
 #: Width of the Cauchy kernel, in sigmas.
 KERNEL_WIDTH = 2.5
+#: What noise adds to the information varies about its mean by a quarter or so.
+NOISE_MARGIN = 1.25
 #: Residuals under this many sigmas count as fitting.
 INLIER_SIGMAS = 3.0
 
@@ -44,7 +46,8 @@ class SurfaceMatch:
         overlap: share of the touches that lie where the surface is known.
         inliers: share of those whose residual is within three sigmas.
         rms: of the inliers' residuals, m.
-        relief: standard deviation of the surface's heights under the touches, its common tilt left out, m.
+        cost: mean squared residual, each at most three sigmas, m2: what places are compared by.
+        heights: of the surface under the touches on it, with their x and y: shape (k, 3), m.
     """
 
     pose: FloatArray
@@ -54,7 +57,17 @@ class SurfaceMatch:
     overlap: float
     inliers: float
     rms: float
-    relief: float
+    cost: float
+    heights: FloatArray
+
+    @property
+    def relief(self) -> float:
+        """Standard deviation of the surface's heights under the touches, its common tilt left out, m."""
+        if len(self.heights) < 4:
+            return 0.0
+        plane = np.column_stack([np.ones(len(self.heights)), self.heights[:, :2] - self.heights[:, :2].mean(axis=0)])
+        tilt, *_ = np.linalg.lstsq(plane, self.heights[:, 2], rcond=None)
+        return float(np.std(self.heights[:, 2] - plane @ tilt))
 
 
 def placed(points: FloatArray, pose: FloatArray) -> FloatArray:
@@ -99,7 +112,9 @@ def fit(
         known = patches.known
         if int(known.sum()) < 4:
             nothing = np.zeros((4, 4))
-            return SurfaceMatch(pose, nothing, nothing, np.zeros(4), float(known.mean()), 0.0, 0.0, 0.0)
+            return SurfaceMatch(
+                pose, nothing, nothing, np.zeros(4), float(known.mean()), 0.0, 0.0, np.inf, np.zeros((0, 3))
+            )
         r = q[known, 2] - patches.height[known]
         J = residual_jacobian(q[known], pose, patches.slope[known])
         inverse_variance = 1.0 / patches.variance[known]
@@ -142,10 +157,10 @@ def slope_noise_information(q: FloatArray, pose: FloatArray, slope_noise: FloatA
 
 
 def _less(H: FloatArray, noise: FloatArray) -> FloatArray:
-    """H without twice what noise adds (it adds so much in the mean, and may add more), kept positive semidefinite."""
+    """H without what noise adds, and somewhat more, as that is a mean; kept positive semidefinite."""
     values, vectors = np.linalg.eigh(H)
     kept = np.einsum("ia,ij,ja->a", vectors, noise, vectors)
-    share = np.clip(1.0 - 2.0 * kept / np.maximum(values, 1e-12), 0.0, 1.0)
+    share = np.clip(1.0 - NOISE_MARGIN * kept / np.maximum(values, 1e-12), 0.0, 1.0)
     return np.asarray((vectors * (values * share)) @ vectors.T)
 
 
@@ -158,11 +173,9 @@ def _judged(
     residual: FloatArray,
 ) -> SurfaceMatch:
     known = patches.known
-    fits = np.abs(residual) < INLIER_SIGMAS * np.sqrt(patches.variance[known])
+    limit = INLIER_SIGMAS * np.sqrt(patches.variance[known])
+    fits = np.abs(residual) < limit
+    cost = float(np.mean(np.minimum(residual**2, limit**2)))
     rms = float(np.sqrt(np.mean(residual[fits] ** 2))) if fits.any() else 0.0
-    heights = patches.height[known]
-    xy = q[known, :2] - q[known, :2].mean(axis=0)
-    plane = np.column_stack([np.ones(len(xy)), xy])
-    tilt, *_ = np.linalg.lstsq(plane, heights, rcond=None)
-    relief = float(np.std(heights - plane @ tilt))
-    return SurfaceMatch(pose, *H, gradient, float(known.mean()), float(fits.mean()), rms, relief)
+    heights = np.column_stack([q[known, :2], patches.height[known]])
+    return SurfaceMatch(pose, *H, gradient, float(known.mean()), float(fits.mean()), rms, cost, heights)
