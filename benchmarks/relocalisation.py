@@ -1,6 +1,6 @@
 """Relocalisation in a saved map: random starts in the thesis's map, and drives over ground that no map knows.
 
-Usage: python -m benchmarks.relocalisation [--drives N] [--foreign N] [--jobs N] [--recording FILE ...]
+Usage: python -m benchmarks.relocalisation [--drives N] [--foreign N] [--jobs N] [--source S ...] [--recording FILE ...]
 
 The map is made by replaying the recordings one after the other into one database (the second continues the first).
 Each drive starts at a random place and heading of the mapped ground and follows random legs at 0.15 m/s, simulated
@@ -127,6 +127,7 @@ def main() -> None:
     parser.add_argument("--foreign", type=int, default=20, help="the same on each foreign ground")
     parser.add_argument("--jobs", type=int, default=2, help="drives at the same time")
     parser.add_argument("--recording", type=Path, nargs="+", default=[RECORDINGS / "scenario-5.mcap"])
+    parser.add_argument("--source", nargs="+", default=SOURCES, choices=SOURCES, help="of odometry")
     chosen = parser.parse_args()
     table = Table(title="relocalisation")
     for column in ("world", "source", "drives", "known within 1 m", "2 m", "3 m", "never", "wrong and confident",
@@ -139,13 +140,14 @@ def main() -> None:
         known, _ = saved(database)
         print(f"map: {len(known.keyframes)} keyframes, {time.perf_counter() - begin:.0f} s", flush=True)
         for world in ("thesis", "random:2", "corridor"):
-            for source in SOURCES:
+            for source in chosen.source:
                 count = chosen.drives if world == "thesis" else chosen.foreign
                 jobs = [
                     pool.submit(drive, database, chosen.recording[0], world, source, number) for number in range(count)
                 ]
                 if jobs:
                     table.add_row(world, source, *row([job.result() for job in jobs]))
+                    print(f"{world} {source}: {time.perf_counter() - begin:.0f} s", flush=True)
     Console(width=160).print(table)
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
+import subprocess
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -10,15 +12,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.random_drives import simulated_robot
+from drivers.recording_reader import Recording
 from robominer_slam.configuration.file import ConfigurationError
 from robominer_slam.configuration.model import SlamSection
 from robominer_slam.replay import replay
 from robominer_slam.replay_session import open_session, split_name
+from robominer_slam.slam.keyframe import BackendResult
 from robominer_slam.slam.level_map import from_saved
 from robominer_slam.slam.saved_map import SavedMap
 from robominer_slam.store import MapStore, StoreError
 from robominer_slam.store_reader import load_map, map_to_start_in
-from tests.saved_drives import TURNED, follow, loop_map, robust_inputs, stream
+from sim_backend.demo import program
+from sim_backend.recorder import record
+from tests.saved_drives import LOOP, RECORDING, TURNED, follow, loop_map, robust_inputs, stream
 from tests.test_store import result, rows
 
 
@@ -29,8 +36,6 @@ def content(path: Path) -> list[list[tuple]]:
 
 def write(path: Path, saved: SavedMap, name: str = "") -> None:
     """A map into a new database, through the store."""
-    from robominer_slam.slam.keyframe import BackendResult
-
     with MapStore(path, 0.2, "rm3", name) as store:
         store.add(
             BackendResult(
@@ -120,8 +125,6 @@ def test_a_second_session_goes_on_in_the_same_map(tmp_path):
     followed = follow(drive, session.known, "continue")
     assert session.store is not None
     with session.store as store:
-        from robominer_slam.slam.keyframe import BackendResult
-
         store.add(
             BackendResult(
                 followed.entered[-1], np.eye(4), followed.map.poses, np.zeros((3, 3)), followed.map.edges, 0, 1,
@@ -214,3 +217,44 @@ def _cut(inputs):
                 yield item
 
     return replace(inputs, recording=Cut())
+
+
+def test_replay_saves_a_map_and_finds_its_place_in_it(tmp_path):
+    """By the command line: what one replay stores, the next one starts in."""
+    config = tmp_path / "robust.toml"
+    config.write_text('[robot]\nlayout = "thesis-grid"\n[slam]\nmethod = "robust"\n')
+    recording = str(short_recording(tmp_path))
+
+    def run(*more: str, code: int = 0) -> dict:
+        done = subprocess.run(
+            program("replay", recording, "--config", str(config), "--json", *more),
+            capture_output=True, text=True, timeout=120, check=False,
+        )  # fmt: skip
+        assert done.returncode == code, done.stderr
+        assert "Traceback" not in done.stderr
+        return json.loads(done.stdout) if code == 0 else {"error": done.stderr}
+
+    database = str(tmp_path / "map.db")
+    made = run("--store", database)
+    assert made["tracking_frames"] == made["frames"]
+    followed = run("--map", database, "--tum", str(tmp_path / "slam.tum"))
+    assert followed["keyframes"] == made["keyframes"]
+    assert 0 < followed["tracking_frames"] < followed["frames"]
+    continued = run("--map", database + ":1", "--start", "continue", "--store", database)
+    assert continued["keyframes"] > made["keyframes"]
+    assert load_map(Path(database))[1].ids == tuple(range(continued["keyframes"]))
+    assert "no map is called 'west'" in run("--map", database + ":west", code=2)["error"]
+
+
+def short_recording(folder: Path) -> Path:
+    """LOOP twice over, as a recording that carries its calibration."""
+    path = folder / "loop.mcap"
+    robot = simulated_robot("thesis", np.array(LOOP), 7)
+    record(
+        robot.events(),
+        path,
+        array=(8, 8, robot.settings.sensor_period_us),
+        attachments=Recording(RECORDING).attachments(),
+        whisker_truth=False,
+    )
+    return path

@@ -50,7 +50,11 @@ class RelocalisationSection(Section):
         low=1, high=50,
     )  # fmt: skip
     patience: int = parameter(
-        12, "1", "keyframes after which contradictions are dropped: ground changes; a break is believed", low=2, high=200
+        12,
+        "1",
+        "keyframes after which contradictions are dropped: ground changes; a break is believed",
+        low=2,
+        high=200,
     )
     elsewhere: float = parameter(
         0.25, "m", "a second opinion this far from where the robot is thought to be contradicts it", low=0.05, high=5.0

@@ -172,7 +172,9 @@ def _linearised(
     pivot: FloatArray,
     system: SystemPattern,
 ) -> tuple[SuperLU, FloatArray, FloatArray, float, FloatArray, FloatArray]:
-    """Factors of H_xx, steps of poses (f, 3) and bias (nb,), promised gain, H_xx^-1 H_xb (3 f, nb), and the bias's
+    """Factors of H_xx, and what they tell.
+
+    These are the steps of poses (f, 3) and bias (nb,), the promised gain, H_xx^-1 H_xb (3 f, nb), and the bias's
     information when the poses are eliminated (nb, nb).
     """
     edges = problem.edges(bias)

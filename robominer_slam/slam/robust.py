@@ -108,7 +108,8 @@ class RobustBackend:
         # What the loops have taught of the biases stays; what the odometry has learned since is added.
         graph.bias = graph.bias + (posterior - graph.bias_prior) if graph.bias.size == nb else posterior.copy()
         graph.bias_prior = posterior
-        graph.bias_prior_information = np.linalg.inv(motion.bias_covariance[:nb, :nb] + 1e-14 * np.eye(nb))
+        prior_covariance = motion.bias_covariance[:nb, :nb] + 1e-14 * np.eye(nb)
+        graph.bias_prior_information = np.asarray(np.linalg.inv(prior_covariance), dtype=np.float64)
         step = geometry.se2_exp(edge.jacobian @ (graph.bias - edge.reference))
         graph.poses[k] = geometry.se2_compose(graph.poses[self._last.id], geometry.se2_compose(Z, step))
         graph.heights[k] = graph.heights[self._last.id] + dz
@@ -204,7 +205,9 @@ class RobustBackend:
         """Covariance of the odometry between two keyframes, summed along the way; as of steps, arms left out."""
         low, high = min(a, b), max(a, b)
         steps = [e for e in self._graph.edges if e.kind == "odometry" and low < e.j <= high]
-        total: FloatArray = sum((np.linalg.inv(e.information) for e in steps), np.zeros((3, 3)))
+        total = np.zeros((3, 3))
+        for edge in steps:
+            total += np.linalg.inv(edge.information)
         return total
 
     def _add_loop(self, closure: Closure) -> None:

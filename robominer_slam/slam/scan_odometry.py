@@ -89,7 +89,7 @@ class ScanOdometry:
         self._map.update(self.travelled, pose[:2], self._reach)
         if not len(self._map.surface):
             return None
-        prior = np.linalg.inv(covariance + np.eye(4) * 1e-12)
+        prior: FloatArray = np.asarray(np.linalg.inv(covariance + np.eye(4) * 1e-12), dtype=np.float64)
         found = fit(self._map.surface, points, pose, prior, associations=self._parameters.associations)
         if found.overlap * len(points) < LEAST_CONTACTS:
             return None
@@ -148,5 +148,5 @@ class ScanOdometry:
 
 def _least(information: FloatArray, right_side: FloatArray) -> FloatArray:
     """Shortest solution of H d = b: directions without information stay where they are."""
-    solution: FloatArray = np.linalg.lstsq(information, right_side, rcond=1e-9)[0]
+    solution: FloatArray = np.asarray(np.linalg.lstsq(information, right_side, rcond=1e-9)[0], dtype=np.float64)
     return solution
