@@ -240,7 +240,9 @@ class Pipeline:
             if self._scan_odometry is not None:
                 keyframe = replace(keyframe, breaks=self._scan_odometry.breaks)
             if self._prior is not None:
-                keyframe = replace(keyframe, prior=self._prior)
+                # Told some way before the keyframe was complete.
+                x, y, yaw, _ = levelled(self._T_map_odom @ T_odom_base)[0].tolist()
+                keyframe = replace(keyframe, prior=replace(self._prior, x=x, y=y, yaw=yaw))
                 self._prior, self._sought_from = None, keyframe.id
             self._odometry_of_keyframe[keyframe.id] = odometry.covariance
             if keyframe.id == 0:

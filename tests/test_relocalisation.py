@@ -163,6 +163,26 @@ def test_a_break_means_carried_away_once_the_map_contradicts_or_nothing_explains
     assert doubts.carried_away
 
 
+def test_a_map_without_touches_has_no_place_for_anything():
+    search = GlobalSearch(np.zeros((0, 3)), 0.06, 1.0)
+    points = np.random.default_rng(0).uniform(-0.3, 0.3, (200, 3))
+    assert len(search.find(points, 0.2, 0.5, 4).poses) == 0
+
+
+def test_after_a_way_over_unmapped_ground_a_frozen_map_is_entered_by_search_alone():
+    """Over there odometry drifts: the sigma says so, no match near the prediction is taken, and it is found again."""
+    places = ((0.6, 0.1), (0.2, 0.3), (0.7, 0.3), (0.3, 0.1), (0.3, 1.3), (1.3, 1.3), (1.3, 0.9), (0.5, 0.3), (0.05, 0.3),
+              (0.6, 0.1))  # fmt: skip
+    out_and_back = tuple((x, y, 0.0) for x, y in places)
+    followed = follow(stream("thesis", out_and_back, 14), loop_map(), "localize")
+    first = known_at(followed)
+    errors = np.array(followed.errors[first:])
+    sigmas = np.sqrt([np.trace(frame.covariance[:2, :2]) for frame in followed.frames[first:]])
+    assert (errors < 4.0 * sigmas + 0.03).all()
+    assert followed.frames[-1].state == "tracking"
+    assert errors[-1] < 0.05
+
+
 def test_the_search_finds_a_patch_in_a_map_at_any_heading_and_height():
     rng = np.random.default_rng(3)
     waves = rng.uniform(4.0, 15.0, (12, 2)) * rng.choice([-1, 1], (12, 2))

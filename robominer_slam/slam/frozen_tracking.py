@@ -21,6 +21,10 @@ FloatArray = NDArray[np.float64]
 
 #: Of odometry's step where it does not tell its noise: m, m, rad per keyframe.
 STEP_SIGMAS = (0.01, 0.01, 0.01)
+#: Beyond these a match from the prediction may be a neighbour of the right one: only a search tells, m and rad.
+UNCERTAIN_M, UNCERTAIN_YAW = 0.05, 0.06
+#: Chi-square of a correction, three axes: 0.1 % by chance.
+GATE = 16.3
 
 
 class FrozenTracker:
@@ -63,9 +67,16 @@ class FrozenTracker:
         prior = np.diag([1.0 / 0.1**2, 1.0 / 0.1**2, 1.0 / 0.1**2, 1.0 / 0.02**2])
         match = fit(self._ground.surface, points, self.pose, prior, 3)
         section = self._parameters.relocalisation
-        if match.overlap >= self._parameters.closure.min_overlap and match.inliers >= section.min_inliers_window:
+        enough = match.overlap >= self._parameters.closure.min_overlap and match.inliers >= section.min_inliers_window
+        if enough and not self.uncertain:
             self._correct(match)
         return match
+
+    @property
+    def uncertain(self) -> bool:
+        """Whether the prediction is too vague for a match to correct it: after a way over unmapped ground."""
+        sigma = float(np.sqrt(np.linalg.eigvalsh(self.covariance[:2, :2])[-1]))
+        return sigma > UNCERTAIN_M or bool(np.sqrt(self.covariance[YAW, YAW]) > UNCERTAIN_YAW)
 
     def _grown(self, raw: Keyframe, step: FloatArray) -> FloatArray:
         """Covariance of x, y, heading in map after a step."""
@@ -92,8 +103,10 @@ class FrozenTracker:
         noise = p.inflation * np.linalg.inv(planar + np.eye(3) * 1e-3) + floor
         innovation = match.pose[:3] - self.pose[:3]
         innovation[YAW] = geometry.wrap_angle(innovation[YAW])
-        S = self.covariance + noise
-        K = self.covariance @ np.linalg.inv(S)
+        weight = np.linalg.inv(self.covariance + noise)
+        if float(innovation @ weight @ innovation) > GATE:
+            return
+        K = self.covariance @ weight
         self.pose[:3] = self.pose[:3] + K @ innovation
         self.pose[3] = match.pose[3]
         # The map itself is no better than a match: matches on the same ground do not average that out.

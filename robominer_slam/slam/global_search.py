@@ -56,8 +56,8 @@ class GlobalSearch:
     """
 
     def __init__(self, touches: FloatArray, cell: float, reach: float) -> None:
-        low = touches[:, :2].min(axis=0) - reach
-        high = touches[:, :2].max(axis=0) + reach
+        low = touches[:, :2].min(axis=0, initial=0.0 if not len(touches) else np.inf) - reach
+        high = touches[:, :2].max(axis=0, initial=0.0 if not len(touches) else -np.inf) + reach
         self._origin, self._shape = grid_around(low, high, cell)
         self._cell, self._reach = cell, reach
         grid = SearchGrid(touches, self._origin, self._shape, cell)

@@ -230,12 +230,13 @@ class LocalisedBackend:
         else:
             self._doubts.notice(keyframe)
             self._doubts.judge(self._tracker.follow(keyframe, taken))
-            if not self._doubts.any:
+            if not self._doubts.any and not self._tracker.uncertain:
                 self._second_opinion = None
             else:
                 place = self._asked(self._base, [keyframe])
                 assert self._second_opinion is not None
-                if place is not None and not self._near(place.pose, self._tracker.pose):
+                here = place is not None and self._near(place.pose, self._tracker.pose)
+                if place is not None and (self._tracker.uncertain or not here):
                     self._track(taken, place, self._second_opinion)
                 elif place is not None:
                     self._doubts.clear()
