@@ -171,8 +171,8 @@ def test_a_map_without_touches_has_no_place_for_anything():
 
 def test_after_a_way_over_unmapped_ground_a_frozen_map_is_entered_by_search_alone():
     """Over there odometry drifts: the sigma says so, no match near the prediction is taken, and it is found again."""
-    places = ((0.6, 0.1), (0.2, 0.3), (0.7, 0.3), (0.3, 0.1), (0.3, 1.3), (1.3, 1.3), (1.3, 0.9), (0.5, 0.3), (0.05, 0.3),
-              (0.6, 0.1))  # fmt: skip
+    places = ((0.6, 0.1), (0.2, 0.3), (0.7, 0.3), (0.3, 0.1), (0.3, 1.3), (1.3, 1.3), (1.3, 0.9), (0.5, 0.3),
+              (0.05, 0.3), (0.6, 0.1))  # fmt: skip
     out_and_back = tuple((x, y, 0.0) for x, y in places)
     followed = follow(stream("thesis", out_and_back, 14), loop_map(), "localize")
     first = known_at(followed)

@@ -150,7 +150,7 @@ class SlamSection(Section):
     """Simultaneous localisation and mapping."""
 
     method: Literal["robust", "thesis", "none"] = parameter(
-        "thesis", "", "robust: this project's; thesis: its pipeline; none: odometry alone"
+        "robust", "", "robust: this project's; thesis: its pipeline; none: odometry alone"
     )
     start: Literal["new", "continue", "localize"] = parameter(
         "new", "", "new: an empty map; continue: go on with a saved one; localize: follow the pose in it, unchanged"

@@ -90,13 +90,13 @@ class RobustEstimationSection(Section):
     )
     sigma_still: float = parameter(0.002, "m/s, rad/s", "creep of a robot whose screws stand", low=1e-5, high=0.1)
     sigma_match: float = parameter(
-        0.0005, "m", "what scan matches have in common: a row's whiskers err by 1.2 mm each against the next row's",
+        0.0001, "m", "what scan matches have in common: whiskers' errors of 1.2 mm each, averaged",
         low=0.0, high=0.1,
     )  # fmt: skip
     sigma_match_yaw_deg: float = parameter(
-        0.12, "deg", "as sigma_match, over the array's half width", low=0.0, high=5.0
+        0.07, "deg", "as sigma_match, over the array's half width", low=0.0, high=5.0
     )
-    match_length: float = parameter(3.0, "m", "way over which that stays the same", low=0.01, high=100.0)
+    match_length: float = parameter(10.0, "m", "way over which that stays the same", low=0.01, high=100.0)
     tilt_time_constant: float = parameter(
         5.0, "s", "averages the specific force's noise; a BNO080's gyro drifts by 0.3 deg in it", low=0.5, high=300.0
     )

@@ -159,9 +159,9 @@ def _binned(xy: FloatArray, z: FloatArray, shape: tuple[int, int], cell: float) 
     inside = ((ij >= 0) & (ij < np.array(shape))).all(axis=1)
     place = ij[inside, 0] * shape[1] + ij[inside, 1]
     size = shape[0] * shape[1]
-    total: FloatArray = np.bincount(place, weights=z[inside], minlength=size).reshape(shape).astype(np.float64)
-    count: FloatArray = np.bincount(place, minlength=size).reshape(shape).astype(np.float64)
-    return total, count
+    total: FloatArray = np.bincount(place, weights=z[inside], minlength=size).astype(np.float64)
+    count: FloatArray = np.bincount(place, minlength=size).astype(np.float64)
+    return total.reshape(shape), count.reshape(shape)
 
 
 def _transformed(xy: FloatArray, z: FloatArray, shape: tuple[int, int], cell: float) -> tuple[FloatArray, ...]:

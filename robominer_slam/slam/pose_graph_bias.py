@@ -172,10 +172,11 @@ def _linearised(
     pivot: FloatArray,
     system: SystemPattern,
 ) -> tuple[SuperLU, FloatArray, FloatArray, float, FloatArray, FloatArray]:
-    """Factors of H_xx, and what they tell.
+    """Solve the normal equations once.
 
-    These are the steps of poses (f, 3) and bias (nb,), the promised gain, H_xx^-1 H_xb (3 f, nb), and the bias's
-    information when the poses are eliminated (nb, nb).
+    Returns:
+        Factors of H_xx, steps of poses (f, 3) and bias (nb,), promised gain, H_xx^-1 H_xb (3 f, nb), and the bias's
+        information when the poses are eliminated (nb, nb).
     """
     edges = problem.edges(bias)
     gradient, blocks = normal_equations(edges, costs, poses, pivot, system, "gtsam")

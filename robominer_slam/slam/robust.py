@@ -28,6 +28,8 @@ FloatArray = NDArray[np.float64]
 PLANAR = [0, 1, 5]
 #: A patch of fewer touches is too small to be told from others.
 LEAST_POINTS = 60
+#: Least variance of an odometry edge in x, y (m2) and heading (rad2): a keyframe's instant is known to 5 ms or so.
+EDGE_FLOOR = np.square([0.001, 0.001, 0.001])
 #: Deviation of the height from one keyframe to the next, m, where the odometry does not say.
 HEIGHT_WALK = 0.002
 HEIGHT_SIGMA = 0.003
@@ -91,13 +93,13 @@ class RobustBackend:
         if not nb:
             J = motion.bias_jacobian[PLANAR]
             covariance = covariance + J @ motion.bias_covariance @ J.T
-        information = np.linalg.inv(covariance + np.diag([1e-8, 1e-8, 1e-8]))
+        information = _inverse(covariance + np.diag(EDGE_FLOOR))
         edge = LevelEdge(
             "odometry",
             self._last.id,
             k,
             Z,
-            0.5 * (information + information.T),
+            information,
             dz,
             1.0 / HEIGHT_WALK**2,
             motion.bias_jacobian[PLANAR][:, :nb],
@@ -165,7 +167,7 @@ class RobustBackend:
         if edge is None:
             return self._covariance
         Ad = geometry.se2_adjoint(geometry.se2_inverse(edge.Z))
-        grown: FloatArray = Ad @ self._covariance @ Ad.T + np.linalg.inv(edge.information)
+        grown: FloatArray = Ad @ self._covariance @ Ad.T + _inverse(edge.information)
         return grown
 
     def _agreed(self, found: list[Closure]) -> list[Closure]:
@@ -205,21 +207,19 @@ class RobustBackend:
         """Covariance of the odometry between two keyframes, summed along the way; as of steps, arms left out."""
         low, high = min(a, b), max(a, b)
         steps = [e for e in self._graph.edges if e.kind == "odometry" and low < e.j <= high]
-        total = np.zeros((3, 3))
-        for edge in steps:
-            total += np.linalg.inv(edge.information)
+        total: FloatArray = sum((_inverse(e.information) for e in steps), np.zeros((3, 3)))
         return total
 
     def _add_loop(self, closure: Closure) -> None:
         nb = self._graph.bias.size
-        information = np.linalg.inv(closure.covariance)
+        information = _inverse(closure.covariance)
         self._graph.edges.append(
             LevelEdge(
                 "loop",
                 closure.i,
                 closure.j,
                 closure.Z,
-                0.5 * (information + information.T),
+                information,
                 closure.dz,
                 1.0 / HEIGHT_SIGMA**2,
                 np.zeros((3, nb)),
@@ -297,3 +297,9 @@ def levelled(T: FloatArray) -> tuple[FloatArray, FloatArray]:
     c, s = np.cos(yaw), np.sin(yaw)
     R_yaw = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     return np.array([T[0, 3], T[1, 3], yaw, T[2, 3]]), R_yaw.T @ T[:3, :3]
+
+
+def _inverse(matrix: FloatArray) -> FloatArray:
+    """Inverse of a covariance or an information matrix, symmetric to the bit."""
+    inverse = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+    return 0.5 * (inverse + inverse.T)

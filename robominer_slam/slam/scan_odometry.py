@@ -148,5 +148,4 @@ class ScanOdometry:
 
 def _least(information: FloatArray, right_side: FloatArray) -> FloatArray:
     """Shortest solution of H d = b: directions without information stay where they are."""
-    solution: FloatArray = np.asarray(np.linalg.lstsq(information, right_side, rcond=1e-9)[0], dtype=np.float64)
-    return solution
+    return np.asarray(np.linalg.lstsq(information, right_side, rcond=1e-9)[0], dtype=np.float64)

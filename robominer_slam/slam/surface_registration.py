@@ -29,6 +29,8 @@ REWEIGHTINGS = 3
 KERNEL_WIDTH = 2.5
 #: What noise adds to the information varies about its mean by a quarter or so.
 NOISE_MARGIN = 1.25
+#: Deviation of headings within a surface, rad.
+TURN_SIGMA = 0.03
 #: Residuals under this many sigmas count as fitting.
 INLIER_SIGMAS = 3.0
 
@@ -129,7 +131,8 @@ def fit(
             step = np.linalg.solve(H + regular, -JtW @ r - prior_information @ offset)
         gradient = JtW @ (r + J @ step)
         pose = pose + step
-    noise = slope_noise_information(q[known], pose, patches.slope_noise[known], weight)
+    slope_noise = patches.slope_noise[known] + turned_slope_noise(patches.slope[known])
+    noise = slope_noise_information(q[known], pose, slope_noise, weight)
     return _judged(pose, (_less(H, noise), H), gradient, patches, q, r + J @ step)
 
 
@@ -137,6 +140,15 @@ def height_left_free(H: FloatArray) -> FloatArray:
     """Information about (x, y, yaw), shape (3, 3), of one about (x, y, yaw, z): the Schur complement of z."""
     planar: FloatArray = H[:3, :3] - np.outer(H[:3, Z], H[Z, :3]) / max(float(H[Z, Z]), 1e-12)
     return planar
+
+
+def turned_slope_noise(slope: FloatArray) -> FloatArray:
+    """Covariance (m, 2, 2) of slopes (m, 2) by headings that were a little off when the surface was touched.
+
+    A ridge that was mapped slightly turned has a slope along itself, and would tell a place along it.
+    """
+    across = np.column_stack([-slope[:, 1], slope[:, 0]]) * TURN_SIGMA
+    return across[:, :, None] * across[:, None, :]
 
 
 def slope_noise_information(q: FloatArray, pose: FloatArray, slope_noise: FloatArray, weight: FloatArray) -> FloatArray:
