@@ -74,9 +74,7 @@ class RobustBackend:
 
     def _add_node(self, keyframe: Keyframe) -> None:
         level, tilt = levelled(keyframe.T_odom_base)
-        # Heights over the plane are the floor's: what touches walls goes into the map only.
-        floor = keyframe.points if keyframe.floor is None else keyframe.points[keyframe.floor]
-        points = voxel_filter(floor @ tilt.T, self._parameters.point_voxel)
+        points = voxel_filter(keyframe.floor_points @ tilt.T, self._parameters.point_voxel)
         k = keyframe.id
         self._patches[k] = Patch(points, keyframe.travelled)
         self._tilts[k] = tilt
@@ -112,7 +110,8 @@ class RobustBackend:
         # What the loops have taught of the biases stays; what the odometry has learned since is added.
         graph.bias = graph.bias + (posterior - graph.bias_prior) if graph.bias.size == nb else posterior.copy()
         graph.bias_prior = posterior
-        graph.bias_prior_information = np.linalg.inv(motion.bias_covariance[:nb, :nb] + 1e-14 * np.eye(nb))
+        prior_covariance = motion.bias_covariance[:nb, :nb] + 1e-14 * np.eye(nb)
+        graph.bias_prior_information = np.asarray(np.linalg.inv(prior_covariance), dtype=np.float64)
         step = geometry.se2_exp(edge.jacobian @ (graph.bias - edge.reference))
         graph.poses[k] = geometry.se2_compose(graph.poses[self._last.id], geometry.se2_compose(Z, step))
         graph.heights[k] = graph.heights[self._last.id] + dz
