@@ -56,6 +56,7 @@ def build_pipeline(
         composite_scan=composite,
         runner=runner,
         scan_odometry=build_scan_odometry(configuration, layout),
+        points_down=points_down(layout),
         imu_mounts={
             device.name: geometry.matrix_from_rpy(np.deg2rad(device.mount_rpy_deg))
             for device in configuration.device
@@ -83,6 +84,11 @@ def build_slam(configuration: Configuration, execution: Execution) -> tuple[Comp
     if execution == "threaded":
         return composite, ThreadedRunner(backend, latency_ns, slam.backend_queue)
     return composite, SynchronousRunner(backend, latency_ns)
+
+
+def points_down(layout: WhiskerLayout) -> NDArray[np.bool_]:
+    """Whiskers that feel the floor, shape (n,): mounted within 30 degrees of straight down."""
+    return np.asarray(layout.R_base_whisker[:, 2, 2] <= -np.cos(np.deg2rad(30.0)))
 
 
 def build_scan_odometry(configuration: Configuration, layout: WhiskerLayout) -> ScanOdometry | None:

@@ -54,6 +54,8 @@ class Pipeline:
         runner: of the back-end; None for odometry alone.
         imu_mounts: rotation of each device's IMU in base_link, shape (3, 3), by device name.
         reorder_window_ns: see `ReorderBuffer`.
+        scan_odometry: scan matching, for the method that has it.
+        points_down: which whiskers feel the floor, shape (n,); None: all.
     """
 
     def __init__(
@@ -67,6 +69,7 @@ class Pipeline:
         imu_mounts: Mapping[str, FloatArray],
         reorder_window_ns: int,
         scan_odometry: ScanOdometry | None = None,
+        points_down: NDArray[np.bool_] | None = None,
     ) -> None:
         self.reorder = ReorderBuffer(reorder_window_ns)
         self.angle_estimator = angle_estimator
@@ -80,6 +83,7 @@ class Pipeline:
         self._composite = composite_scan
         self._imu_mounts = imu_mounts
         self._scan_odometry = scan_odometry
+        self._points_down = np.ones(angle_estimator.count, dtype=np.bool_) if points_down is None else points_down
         self._T_map_odom = np.eye(4)
         self._last_result: BackendResult | None = None
         self._odometry_at_result: FloatArray | None = None
@@ -162,12 +166,13 @@ class Pipeline:
         if isinstance(self._dead_reckoning, FeelsMotion):
             self._dead_reckoning.add_contacts(stamp, contacts)
             odometry = self._dead_reckoning.state_at(stamp)
-        odometry = self._matched(stamp, odometry, contacts.points)
+        floor = self._points_down[contacts.index]
+        odometry = self._matched(stamp, odometry, contacts.points[floor])
         T_odom_base = planar_pose(odometry)
         backend_results = self.runner.due(stamp) if self.runner is not None else []
         for result in backend_results:
             self._take(result)
-        keyframe = self._keyframe(stamp, T_odom_base, contacts.points, odometry)
+        keyframe = self._keyframe(stamp, T_odom_base, contacts.points, floor, odometry)
         state = self._state(stamp)
         return FrameResult(
             stamp_ns=stamp,
@@ -203,11 +208,16 @@ class Pipeline:
         return odometry
 
     def _keyframe(
-        self, stamp: int, T_odom_base: FloatArray, points: FloatArray, odometry: OdometryState
+        self,
+        stamp: int,
+        T_odom_base: FloatArray,
+        points: FloatArray,
+        floor: NDArray[np.bool_],
+        odometry: OdometryState,
     ) -> Keyframe | None:
         if self._composite is None or self.runner is None or self.paused:
             return None
-        keyframe = self._composite.add(stamp, T_odom_base, points)
+        keyframe = self._composite.add(stamp, T_odom_base, points, floor)
         if keyframe is not None:
             if isinstance(self._dead_reckoning, TellsMotion):
                 keyframe = replace(keyframe, motion=self._dead_reckoning.mark_keyframe(stamp))

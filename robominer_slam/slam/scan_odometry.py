@@ -94,7 +94,7 @@ class ScanOdometry:
         H = found.curvature
         gradient = found.gradient - H @ offset
         reduced = gradient[:3] - H[:3, Z] * gradient[Z] / max(H[Z, Z], 1e-12)
-        return ScanCorrection(_least(height_left_free(H), -reduced), information, float(offset[Z]))
+        return ScanCorrection(_least(height_left_free(found.information), -reduced), information, float(offset[Z]))
 
     def add(self, pose: FloatArray, points: FloatArray) -> None:
         """Put a frame's contacts (in base_link, levelled) into the map at its corrected pose (x, y, yaw, z)."""
