@@ -12,7 +12,7 @@ import click
               help="Folder for figures, trajectories, report and logs.")  # fmt: skip
 @click.option("--scenario", type=click.IntRange(1, 5), default=1, show_default=True, help="Of the thesis.")
 @click.option("--seed", default=1, show_default=True, help="Tolerances, biases, noise and slip of all sensors.")
-@click.option("--method", type=click.Choice(["thesis", "none"]), default="thesis", show_default=True,
+@click.option("--method", type=click.Choice(["robust", "thesis", "none"]), default="robust", show_default=True,
               help="SLAM method; none gives exactly the odometry.")  # fmt: skip
 @click.option("--max-time", type=click.FloatRange(min=5.0), help="Cut the drive short, s.")
 @click.option("--record", is_flag=True, help="Also write the drive as OUT/drive.mcap, for replay.")

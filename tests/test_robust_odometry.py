@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import math
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.measurement import ImuSample, OdometrySample, ScrewAngles
-from drivers.recording_reader import Recording
 from robominer_slam import geometry
 from robominer_slam.configuration.robust_estimation_section import RobustEstimationSection
 from robominer_slam.estimation.planar_motion import (
@@ -31,9 +29,7 @@ from robominer_slam.estimation.planar_motion import (
 from robominer_slam.estimation.robust_odometry import RobustOdometry
 from robominer_slam.estimation.screw_kinematics import forward_matrix
 from robominer_slam.estimation.turn_comparison import screw_turn, screw_turn_jacobian
-from robominer_slam.replay import prepare, replay
 
-RECORDINGS = Path(__file__).parent / "recordings"
 MATRIX = forward_matrix(0.078, math.radians(30.0), 0.15, 0.30)
 STEP_NS = 10_000_000
 states = st.lists(st.floats(-0.5, 0.5), min_size=16, max_size=16).map(np.array)
@@ -235,16 +231,58 @@ def test_a_jump_of_an_encoder_moves_nothing():
     assert odometry.stale == 1
 
 
-def test_the_pipeline_gives_poses_in_space_from_the_robust_method():
-    inputs = prepare(RECORDINGS / "scenario-2.mcap", None)
-    configuration = inputs.configuration.model_copy(
-        update={"slam": inputs.configuration.slam.model_copy(update={"method": "robust"})}
-    )
-    frames = []
-    replay(replace(inputs, configuration=configuration), frames.append)
-    truths = [truth for _, truth in Recording(RECORDINGS / "scenario-2.mcap").ground_truth()]
-    last = frames[-1]
-    assert last.odometry.T_odom_base is not None
-    np.testing.assert_array_equal(last.T_odom_base, last.odometry.T_odom_base)
-    assert np.hypot(*(last.T_odom_base[:2, 3] - truths[-1].pose[:2])) < 0.3
-    assert last.odometry.pose_covariance.shape == (6, 6)
+def straight(seconds: float, heading: float = 0.0, bias=(0.0, 0.0, 0.0)) -> RobustOdometry:
+    """Turns on the spot to a heading, marks a keyframe there and drives straight on; odometry alone."""
+    odometry = RobustOdometry(RobustEstimationSection(), "odometry", None, MATRIX)
+    odometry.add(OdometrySample(0, np.zeros(3)))
+    for i in range(1, 31):
+        odometry.add(OdometrySample(i * 33_333_333, np.array([0.0, 0.0, heading])))
+    odometry.mark_keyframe(1_000_000_000)
+    for i in range(31, 31 + round(30 * seconds)):
+        odometry.add(OdometrySample(i * 33_333_333, np.array([0.15, 0.0, 0.0]) + bias))
+    return odometry
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.5])
+def test_a_scan_match_adds_information_only_where_it_is_told(heading):
+    odometry, stamp = straight(5.0, heading), 7_000_000_000
+    before, P = odometry.state_at(stamp), odometry.relative_covariance()
+    ahead = np.array([math.cos(before.yaw), math.sin(before.yaw)])
+    left = np.array([-ahead[1], ahead[0]])
+    information = np.zeros((3, 3))
+    information[:2, :2] = 1e8 * np.outer(ahead, ahead)
+    odometry.correct_pose(stamp, np.append(0.01 * ahead + 0.05 * left, 0.02), information)
+    after, Q = odometry.state_at(stamp), odometry.relative_covariance()
+    moved = np.array([after.x - before.x, after.y - before.y])
+    assert ahead @ moved == pytest.approx(0.01, abs=0.001)
+    assert left @ moved == pytest.approx(0.0, abs=1e-4)
+    assert after.yaw == pytest.approx(before.yaw, abs=1e-3)
+    assert ahead @ Q[:2, :2] @ ahead < 0.05 * (ahead @ P[:2, :2] @ ahead)
+    assert left @ Q[:2, :2] @ left == pytest.approx(left @ P[:2, :2] @ left, rel=0.01)
+    assert Q[2, 2] == pytest.approx(P[2, 2], rel=0.01)
+
+
+def test_a_scan_match_without_information_changes_nothing():
+    odometry = straight(5.0)
+    before, P = odometry.state_at(7_000_000_000), odometry.relative_covariance()
+    odometry.correct_pose(7_000_000_000, np.array([0.1, 0.1, 0.1]), np.diag([0.5, 0.0, 0.1]))
+    after = odometry.state_at(7_000_000_000)
+    assert (after.x, after.y, after.yaw) == (before.x, before.y, before.yaw)
+    np.testing.assert_array_equal(odometry.relative_covariance(), P)
+
+
+def test_scan_matches_teach_the_biases_of_a_ready_made_odometry():
+    bias = np.array([0.003, -0.005, 0.004])
+    odometry = straight(1.0)
+    stamp = 2_000_000_000
+    x = odometry.state_at(stamp).x
+    for i in range(61, 61 + 30 * 30):
+        stamp = i * 33_333_333
+        odometry.add(OdometrySample(stamp, np.array([0.15, 0.0, 0.0]) + bias))
+        x += 0.15 / 30.0
+        if i % 6 == 0:
+            state = odometry.state_at(stamp)
+            odometry.correct_pose(stamp, np.array([x - state.x, -state.y, -state.yaw]), np.diag([1e6, 1e6, 1e6]))
+    np.testing.assert_allclose(odometry.bias[1:], bias[1:], atol=1e-3)
+    assert odometry.bias[0] == pytest.approx(bias[0], abs=2e-3)
+    assert abs(odometry.state_at(stamp).y) < 0.01

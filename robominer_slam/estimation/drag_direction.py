@@ -27,7 +27,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +34,7 @@ from numpy.typing import NDArray
 from robominer_slam.configuration.robust_estimation_section import RobustEstimationSection
 from robominer_slam.contacts import Contacts
 from robominer_slam.estimation.cross_slope import CrossSlope
+from robominer_slam.estimation.drag_information import DragInformation, FrameInformation, TrailingTips, swept_by
 from robominer_slam.layout import WhiskerLayout
 
 FloatArray = NDArray[np.float64]
@@ -59,31 +59,6 @@ METRIC = np.array([1.0, 1.0, ARM])
 SAME_DIRECTION = 0.9
 #: Way over which the shown direction is averaged, m.
 SHOWN_LENGTH = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class DragInformation:
-    """What a frame's tips say about (vx, vy, wz), in information form around the estimate they were judged with.
-
-    Attributes:
-        information: shape (3, 3); singular along the motion itself, of which the tips say nothing.
-        vector: information times the correction of the velocity, shape (3,).
-        tips: how many counted.
-        ahead: direction of motion that it was linearised at, unit vector, shape (2,).
-    """
-
-    information: FloatArray
-    vector: FloatArray
-    tips: int
-    ahead: FloatArray
-
-    def compressed(self) -> tuple[FloatArray, FloatArray]:
-        """Rows H (k, 3) and innovations (k,) with unit covariance that say the same; k of 0 to 3."""
-        values, vectors = np.linalg.eigh(self.information)
-        kept = values > 1e-6 * float(values[-1])
-        root = np.sqrt(values[kept])
-        H = root[:, None] * vectors[:, kept].T
-        return H, (vectors[:, kept].T @ self.vector) / root
 
 
 class DragDirection:
@@ -171,14 +146,14 @@ class DragDirection:
         information = shared @ found.information
         return DragInformation(0.5 * (information + information.T), shared @ found.vector, found.tips, at[:2] / speed)
 
-    def _trailing(self, contacts: Contacts, old: Contacts, span: float, velocity: FloatArray) -> _Tips | None:
+    def _trailing(self, contacts: Contacts, old: Contacts, span: float, velocity: FloatArray) -> TrailingTips | None:
         index = contacts.index
         rod = self.reach(contacts)
         earlier = np.full((2, self._layout.count), np.nan)
         earlier[:, old.index] = self.reach(old)
         turning = (rod - earlier[:, index]) / span
         p = self._layout.p_base[index, :2].T + rod
-        swept = _swept(p, turning, velocity)
+        swept = swept_by(p, turning, velocity)
         speed = np.sqrt(swept[0] ** 2 + swept[1] ** 2)
         d = rod / -np.sqrt(rod[0] ** 2 + rod[1] ** 2)
         ok = (
@@ -190,16 +165,16 @@ class DragDirection:
         if np.count_nonzero(ok) < LEAST_TIPS:
             return None
         gradient = self._slopes.gradient(contacts.points, index)
-        return _Tips(p[:, ok], turning[:, ok], d[:, ok], gradient[:, ok], swept[:, ok])
+        return TrailingTips(p[:, ok], turning[:, ok], d[:, ok], gradient[:, ok], swept[:, ok])
 
-    def _information(self, tips: _Tips, at: FloatArray) -> _Frame:
+    def _information(self, tips: TrailingTips, at: FloatArray) -> FrameInformation:
         """What the tips say about the velocity's difference from its estimate, linearised at `at`."""
-        rows, angle, cross, speed, weight = self._linearised(tips, _swept(tips.p, tips.turning, at))
+        rows, angle, cross, speed, weight = self._linearised(tips, swept_by(tips.p, tips.turning, at))
         steady = tips.swept - tips.turning
         innovation = angle * speed - (rows[0] * steady[0] + rows[1] * steady[1])
         weighted = rows * weight
         sliding = cross * speed
-        return _Frame(
+        return FrameInformation(
             weighted @ rows.T,
             weighted @ innovation,
             len(angle),
@@ -209,7 +184,7 @@ class DragDirection:
         )
 
     @staticmethod
-    def _shown(found: _Frame, velocity: FloatArray, covariance: FloatArray) -> FloatArray:
+    def _shown(found: FrameInformation, velocity: FloatArray, covariance: FloatArray) -> FloatArray:
         """Direction of the motion as this frame shows it: scaled (vx, vy, wz) of length one."""
         correction = np.linalg.solve(np.eye(3) + covariance @ found.information, covariance @ found.vector)
         scaled = (velocity + correction) * METRIC
@@ -217,7 +192,7 @@ class DragDirection:
         return direction
 
     def _linearised(
-        self, tips: _Tips, swept: FloatArray
+        self, tips: TrailingTips, swept: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         """Rows (3, m), angles from motion to rod (m,), cross slopes, speeds and weights at the motion `swept`."""
         speed = np.maximum(np.sqrt(swept[0] ** 2 + swept[1] ** 2), self._settings.drag_least_speed)
@@ -252,7 +227,7 @@ class DragDirection:
         common[2, 2] = turn**2 + (settings.drag_common_curvature * speed) ** 2
         return common
 
-    def _learn_slide(self, found: _Frame, covariance: FloatArray, discount: float) -> None:
+    def _learn_slide(self, found: FrameInformation, covariance: FloatArray, discount: float) -> None:
         """Estimate `slide` from how the tips of this frame differ; what they have in common is the velocity's."""
         both = np.column_stack([found.sliding_rows, found.vector])
         to_velocity = np.linalg.solve(np.eye(3) + covariance @ found.information, covariance @ both)
@@ -266,38 +241,3 @@ class DragDirection:
         self._slide_information = prior + kept * (self._slide_information - prior) + information
         faded = settings.drag_slide + kept * (self.slide - settings.drag_slide)
         self.slide = faded + vector / self._slide_information
-
-
-@dataclass(frozen=True, slots=True)
-class _Tips:
-    """Tips that trail: place p, motion in base_link, direction to the base, ground's gradient, predicted motion.
-
-    All of shape (2, m).
-    """
-
-    p: FloatArray
-    turning: FloatArray
-    d: FloatArray
-    gradient: FloatArray
-    swept: FloatArray
-
-
-@dataclass(frozen=True, slots=True)
-class _Frame:
-    """A frame's information before what its tips have in common is allowed for.
-
-    information (3, 3), vector (3,) and tips as of `DragInformation`; sliding_*: weighted products of each tip's
-    derivative by `slide` with the rows (3,), with itself and with the innovations.
-    """
-
-    information: FloatArray
-    vector: FloatArray
-    tips: int
-    sliding_rows: FloatArray
-    sliding_sliding: float
-    sliding_innovation: float
-
-
-def _swept(p: FloatArray, turning: FloatArray, velocity: FloatArray) -> FloatArray:
-    """Motion of the tips over the ground in base_link's axes, shape (2, m), m/s; arguments as in the module's text."""
-    return np.stack([velocity[0] - velocity[2] * p[1] + turning[0], velocity[1] + velocity[2] * p[0] + turning[1]])

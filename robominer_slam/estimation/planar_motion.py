@@ -118,6 +118,19 @@ def compose(state: FloatArray) -> FloatArray:
     )  # fmt: skip
 
 
+def given_bias(state: FloatArray, P: FloatArray, bias: slice) -> tuple[FloatArray, FloatArray]:
+    """Of the pose since the last keyframe, in its own frame: covariance if the biases were known, slope by them.
+
+    Shapes (3, 3) and (3, nb).
+    """
+    c, s = math.cos(state[YAW]), math.sin(state[YAW])
+    to_new = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    P_bias = P[bias, bias]
+    by_bias = np.linalg.solve(P_bias + 1e-18 * np.eye(len(P_bias)), P[bias, REL]).T
+    conditional = P[REL, REL] - by_bias @ P[bias, REL]
+    return to_new @ conditional @ to_new.T, to_new @ by_bias
+
+
 def compose_jacobian(state: FloatArray) -> FloatArray:
     """Derivative of `compose` by the state, shape (3, n)."""
     J = np.zeros((3, len(state)))

@@ -19,30 +19,30 @@ from numpy.typing import NDArray
 from drivers.measurement import ImuSample, Measurement, OdometrySample, ScrewAngles, ScrewSpeeds
 from robominer_slam.configuration.robust_estimation_section import RobustEstimationSection
 from robominer_slam.contacts import Contacts
+from robominer_slam.estimation import planar_start
 from robominer_slam.estimation.drag_direction import DragDirection
 from robominer_slam.estimation.imu_batch import ImuBatch
 from robominer_slam.estimation.keyframe_motion import KeyframeMotion
 from robominer_slam.estimation.odometry_state import OdometryState
 from robominer_slam.estimation.planar_motion import (
     GYRO_BIAS,
-    KEY_YAW,
     REL,
     SLIP,
-    SLIP_MEAN,
-    SLOW,
     VELOCITY,
     VX,
     VY,
     WZ,
-    YAW,
     Inputs,
     PlanarFilter,
     X,
     Y,
     compose,
     compose_jacobian,
+    given_bias,
     motion_ahead,
 )
+from robominer_slam.estimation.planar_start import MATCH_STATES, ODOMETRY_BIAS
+from robominer_slam.estimation.scan_match import match_measurement, relative_covariance
 from robominer_slam.estimation.screw_speeds import ScrewSpeedAssembly
 from robominer_slam.estimation.spatial_pose import SpatialPose
 from robominer_slam.estimation.turn_comparison import TurnComparison
@@ -52,14 +52,8 @@ Source = Literal["fused", "odometry"]
 
 #: A gap in readings longer than this has no meaningful mean speed.
 MAX_INTERVAL_S = 0.5
-#: Slow states with a ready-made odometry: its biases of vx, vy, wz.
-ODOMETRY_BIAS = slice(SLOW, SLOW + 3)
 #: Squared deviations between screws and gyro beyond which the screws are trusted less.
 DISAGREEMENT = 4.0
-#: Less information about a direction, 1/m2 or 1/rad2, is none.
-LEAST_INFORMATION = 1.0
-#: Velocity at the start may be anything a robot does.
-SIGMA_START = np.array([0.01, 0.01, 0.01])
 
 
 class RobustOdometry:
@@ -84,30 +78,12 @@ class RobustOdometry:
         self._drag = drag
         self._screw_matrix = screw_matrix
         fused = source == "fused"
-        n = SLOW + (7 if fused else 3) + 3
-        # What scan matches have in common: whiskers' errors, as an offset of each match, in the body's axes.
-        self._match = slice(n - 3, n)
-        variance = np.zeros(n)
-        variance[VELOCITY] = SIGMA_START**2
-        self._match_variance = np.square(
-            [settings.sigma_match, settings.sigma_match, np.deg2rad(settings.sigma_match_yaw_deg)]
-        )
-        variance[self._match] = self._match_variance
-        x = np.zeros(n)
-        if fused:
-            variance[GYRO_BIAS] = settings.sigma_gyro_bias**2
-            variance[SLIP_MEAN] = settings.sigma_slip_mean**2
-            variance[SLIP] = settings.sigma_slip**2
-            x[SLIP_MEAN] = settings.slip_mean
-        else:
-            variance[ODOMETRY_BIAS] = settings.sigma_odometry_bias**2
+        x, variance = planar_start.fused(settings) if fused else planar_start.odometry(settings)
+        self._match = slice(len(x) - MATCH_STATES, len(x))
+        self._match_variance = variance[self._match].copy()
         self._bias = slice(GYRO_BIAS, GYRO_BIAS + 1) if fused else ODOMETRY_BIAS
         self._filter = PlanarFilter(x, np.diag(variance), settings.gate)
-        self._H_velocity = np.zeros((3, n))
-        self._H_velocity[:, VELOCITY] = np.eye(3)
-        self._H_odometry = self._H_velocity.copy()
-        if not fused:
-            self._H_odometry[:, ODOMETRY_BIAS] = np.eye(3)
+        self._H_odometry = planar_start.odometry_rows()
         self._R_screws = (screw_matrix[:3] @ screw_matrix[:3].T) * settings.sigma_screw_speed**2
         self._speeds = ScrewSpeedAssembly()
         self._imu = ImuBatch()
@@ -139,8 +115,6 @@ class RobustOdometry:
                 speed = self._speeds.add(measurement)
                 if speed is not None:
                     self._update_screws(measurement.stamp_ns, speed)
-            case _:
-                pass
 
     def add_contacts(self, stamp_ns: int, contacts: Contacts) -> None:
         """Take the contacts of a whisker frame; `state_at` then knows of them."""
@@ -191,15 +165,9 @@ class RobustOdometry:
     def mark_keyframe(self, stamp_ns: int) -> KeyframeMotion:
         """Motion since the last mark (or the start); the present pose becomes the new reference."""
         self._predict(stamp_ns)
-        x, P = self._filter.x, self._filter.P
-        c, s = math.cos(x[YAW]), math.sin(x[YAW])
-        to_new = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-        b = self._bias
-        P_bias = P[b, b].copy()
-        by_bias = np.linalg.solve(P_bias + 1e-18 * np.eye(len(P_bias)), P[b, REL]).T
-        conditional = P[REL, REL] - by_bias @ P[b, REL]
-        T, covariance, jacobian = self._space.motion(x[REL], to_new @ conditional @ to_new.T, to_new @ by_bias)
-        motion = KeyframeMotion(stamp_ns, T, covariance, jacobian, x[b].copy(), x[b].copy(), P_bias)
+        x, P, b = self._filter.x, self._filter.P, self._bias
+        T, covariance, jacobian = self._space.motion(x[REL], *given_bias(x, P, b))
+        motion = KeyframeMotion(stamp_ns, T, covariance, jacobian, x[b].copy(), x[b].copy(), P[b, b].copy())
         self._filter.keyframe()
         self._state = None
         return motion
@@ -213,28 +181,14 @@ class RobustOdometry:
             information: of it, shape (3, 3); directions without information are left alone.
         """
         self._predict(stamp_ns)
-        x = self._filter.x
-        c, s = math.cos(x[KEY_YAW]), math.sin(x[KEY_YAW])
-        to_key = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-        values, vectors = np.linalg.eigh(to_key @ information @ to_key.T)
-        told = values > LEAST_INFORMATION
-        if not told.any():
-            return
-        rows = vectors[:, told].T
-        H = np.zeros((len(rows), len(x)))
-        H[:, REL] = rows
-        H[:, self._match] = rows
-        innovation = rows @ (to_key @ offset - x[self._match])
-        self._filter.correct(innovation, H, np.diag(1.0 / values[told]))
-        self._state = None
+        told = match_measurement(self._filter.x, self._match, offset, information)
+        if told is not None:
+            self._filter.correct(*told)
+            self._state = None
 
     def relative_covariance(self) -> FloatArray:
         """Covariance of (x, y, yaw) since the last keyframe, in odom, shape (3, 3)."""
-        x, P = self._filter.x, self._filter.P
-        c, s = math.cos(x[KEY_YAW]), math.sin(x[KEY_YAW])
-        to_odom = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        covariance: FloatArray = to_odom @ P[REL, REL] @ to_odom.T
-        return covariance
+        return relative_covariance(self._filter.x, self._filter.P)
 
     @property
     def bias(self) -> FloatArray:
@@ -288,21 +242,12 @@ class RobustOdometry:
         if before is None:
             return
         if not comparison.running:
-            self._turn_by_screws(float(screws[2]), still)
+            # Without a gyro, the screws are all that says how fast the body turns.
+            self._filter.correct(*comparison.screws_alone(self._filter.x, float(screws[2]), still, settings))
         elif comparison.add_screws(float(screws[2]) * (stamp_ns - before) * 1e-9, still):
             distance = self._filter.correct(*comparison.measurement(self._filter.x))
             self._distrust = max(1.0, distance / DISAGREEMENT)
             comparison.start(running=True)
-
-    def _turn_by_screws(self, rate: float, still: bool) -> None:
-        """Without a gyro, the screws are all that says how fast the body turns."""
-        ekf, settings = self._filter, self._settings
-        share = 1.0 - settings.slip_mean
-        H = np.zeros((1, len(ekf.x)))
-        H[0, WZ] = 1.0
-        slip = (settings.sigma_slip**2 + settings.sigma_slip_mean**2) * rate**2
-        R = settings.sigma_still**2 if still else self._R_screws[2, 2] + slip
-        ekf.correct(np.array([share * rate - ekf.x[WZ]]), H, np.array([[R]]))
 
     def _predict(self, stamp_ns: int) -> None:
         previous = self._stamp_ns

@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from robominer_slam.estimation.planar_motion import GYRO_BIAS, SLIP, SLIP_MEAN
+from robominer_slam.configuration.robust_estimation_section import RobustEstimationSection
+from robominer_slam.estimation.planar_motion import GYRO_BIAS, SLIP, SLIP_MEAN, WZ
 
 FloatArray = NDArray[np.float64]
 
@@ -79,3 +80,13 @@ class TurnComparison:
         R = self._variance + self._screw_variance * span**2 / self._readings
         innovation = self._screws - screw_turn(state, self._gyro, span)
         return innovation, screw_turn_jacobian(state, self._gyro, span), np.array([[R]])
+
+    def screws_alone(
+        self, state: FloatArray, rate: float, still: bool, settings: RobustEstimationSection
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """As `measurement`, of the turn rate itself: what a reading of the screws says while there is no gyro."""
+        H = np.zeros((1, len(state)))
+        H[0, WZ] = 1.0
+        slip = (settings.sigma_slip**2 + settings.sigma_slip_mean**2) * rate**2
+        R = self._sigma_still**2 if still else self._screw_variance + slip
+        return np.array([(1.0 - settings.slip_mean) * rate - state[WZ]]), H, np.array([[R]])

@@ -187,7 +187,9 @@ def _linearised(
     B = -problem.jacobian
     nb = bias.size
     cross = J_Omega @ B
-    H_xb = np.stack([system.gradient(cross[:, :, c]).reshape(-1) for c in range(nb)], axis=1)
+    H_xb = np.zeros((gradient.size, nb))
+    for c in range(nb):
+        H_xb[:, c] = system.gradient(cross[:, :, c]).reshape(-1)
     BtW = np.swapaxes(B, -1, -2) @ weighted
     H_bb = (BtW @ B).sum(axis=0) + problem.prior_information
     g_b = (BtW @ costs.e[:, :, None])[:, :, 0].sum(axis=0) + problem.prior_information @ (bias - problem.prior)

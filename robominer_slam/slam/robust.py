@@ -110,8 +110,7 @@ class RobustBackend:
         # What the loops have taught of the biases stays; what the odometry has learned since is added.
         graph.bias = graph.bias + (posterior - graph.bias_prior) if graph.bias.size == nb else posterior.copy()
         graph.bias_prior = posterior
-        prior_covariance = motion.bias_covariance[:nb, :nb] + 1e-14 * np.eye(nb)
-        graph.bias_prior_information = np.asarray(np.linalg.inv(prior_covariance), dtype=np.float64)
+        graph.bias_prior_information = _inverse(motion.bias_covariance[:nb, :nb] + 1e-14 * np.eye(nb))
         step = geometry.se2_exp(edge.jacobian @ (graph.bias - edge.reference))
         graph.poses[k] = geometry.se2_compose(graph.poses[self._last.id], geometry.se2_compose(Z, step))
         graph.heights[k] = graph.heights[self._last.id] + dz
