@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from robominer_slam.configuration.bounded_map_section import BoundedMapSection
 from robominer_slam.configuration.parameter import Section, parameter
 
 
@@ -100,3 +101,4 @@ class RobustSlamSection(Section):
     surface: SurfaceSection = Field(default_factory=SurfaceSection)
     scan_matching: ScanMatchingSection = Field(default_factory=ScanMatchingSection)
     closure: ClosureSection = Field(default_factory=ClosureSection)
+    bounds: BoundedMapSection = Field(default_factory=BoundedMapSection)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
 import numpy as np
@@ -61,11 +61,15 @@ class BackendResult:
     Attributes:
         keyframe: the one that was taken in.
         T_map_odom: correction that holds from its effect on, shape (4, 4).
-        poses: of all keyframes in map, shape (n, 4, 4).
+        poses: of all keyframes that are in the graph, in map, in the order of their ids, shape (n, 4, 4).
         covariance: of the keyframe's (x, y, yaw) in map, shape (3, 3).
         edges: of the whole graph.
         closures: loop closures added by this keyframe.
         version: grows by one with each result.
+        added: edges that were not in the result before; None stands for those that end at the keyframe.
+        removed: ids of keyframes that have left the graph with all their edges.
+        points: touches, shape (m, 3), m, in base_link at the keyframe, of keyframes whose touches have changed, by
+            id; none where the map has their ground from others.
     """
 
     keyframe: Keyframe
@@ -75,6 +79,9 @@ class BackendResult:
     edges: Sequence[GraphEdge]
     closures: int
     version: int
+    added: Sequence[GraphEdge] | None = None
+    removed: Sequence[int] = ()
+    points: Mapping[int, FloatArray] = field(default_factory=dict)
 
 
 class Backend(Protocol):
