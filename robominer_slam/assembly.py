@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -20,6 +21,7 @@ from robominer_slam.estimation.robust_odometry import RobustOdometry
 from robominer_slam.estimation.screw_kinematics import forward_matrix
 from robominer_slam.flow_bend import FlowBend
 from robominer_slam.layout import WhiskerLayout
+from robominer_slam.patch_pages import SqlitePages
 from robominer_slam.pipeline import Pipeline
 from robominer_slam.rest_tracking import RestTracker
 from robominer_slam.slam.backend_runner import BackendRunner, SynchronousRunner, ThreadedRunner
@@ -37,10 +39,20 @@ Execution = Literal["synchronous", "threaded"]
 
 
 def build_pipeline(
-    configuration: Configuration, layout: WhiskerLayout, model: PolynomialModel, execution: Execution
+    configuration: Configuration,
+    layout: WhiskerLayout,
+    model: PolynomialModel,
+    execution: Execution,
+    page_folder: Path | None = None,
 ) -> Pipeline:
-    """Assemble the pipeline; `threaded` for the daemon, `synchronous` for replay."""
-    composite, runner = build_slam(configuration, execution)
+    """Assemble the pipeline; `threaded` for the daemon, `synchronous` for replay.
+
+    Args:
+        configuration, layout, model: what it is made of.
+        execution: of the back-end.
+        page_folder: where a map that outgrows the memory is paged to; None for the system's temporary files.
+    """
+    composite, runner = build_slam(configuration, execution, page_folder)
     contact = configuration.contact
     return Pipeline(
         dead_reckoning=_dead_reckoning(configuration, layout),
@@ -65,7 +77,9 @@ def build_pipeline(
     )
 
 
-def build_slam(configuration: Configuration, execution: Execution) -> tuple[CompositeScan | None, BackendRunner | None]:
+def build_slam(
+    configuration: Configuration, execution: Execution, page_folder: Path | None = None
+) -> tuple[CompositeScan | None, BackendRunner | None]:
     """The method's front-end and back-end, fresh; nothing for odometry alone."""
     slam = configuration.slam
     backend: Backend
@@ -78,7 +92,7 @@ def build_slam(configuration: Configuration, execution: Execution) -> tuple[Comp
             backend = ThesisBackend(thesis)
         case "robust":
             composite = CompositeScan(slam.robust.keyframe_distance, slam.robust.keyframe_angle, 0.0)
-            backend = RobustBackend(slam.robust)
+            backend = RobustBackend(slam.robust, SqlitePages(page_folder))
     latency_ns = round(slam.backend_latency * 1e9)
     if execution == "threaded":
         return composite, ThreadedRunner(backend, latency_ns, slam.backend_queue)

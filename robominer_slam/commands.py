@@ -94,7 +94,7 @@ class Commands:
     def _save_map(self, parameters: Mapping[str, str]) -> str:
         if not self._store.flush(STORE_TIMEOUT_S):
             raise CommandError("the disk did not take the map within 5 s; see status")
-        self._store.save_poses(self._map.poses)
+        self._store.save_poses(self._map.poses, self._map.ids)
         name = parameters.get("name", "")
         if name:
             self._store.rename(name)

@@ -151,7 +151,7 @@ class Daemon:
                     self._map.take(result)
                     self._store.add(result, self._clock.offset_ns)
         if self._store.flush(10.0):
-            self._store.save_poses(self._map.poses)
+            self._store.save_poses(self._map.poses, self._map.ids)
         log.info(
             "ended after %d frames: %d keyframes, %d loop closures, %d keyframes stored",
             self._publisher.frames, len(self._map.keyframes), self._map.closures, self._store.written,

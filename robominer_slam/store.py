@@ -1,5 +1,7 @@
 """Keyframes kept in SQLite: one writer thread, batched commits, WAL with full sync.
 
+What the back-end takes out of the graph is taken out here too, with its edges; the edges that bridge it are added.
+
 Schema and tools are sqlite-utils' (imported only when a database is made); the rows of a drive are written with
 plain SQL, since sqlite-utils costs 5 ms a row. A batch is on the disk at most `sync_s` after its oldest keyframe.
 """
@@ -12,13 +14,15 @@ import sqlite3
 import threading
 import time
 import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robominer_slam import geometry
-from robominer_slam.slam.keyframe import BackendResult, GraphEdge
+from robominer_slam.slam.keyframe import BackendResult, GraphEdge, Keyframe
 
 log = logging.getLogger(__name__)
 
@@ -104,6 +108,25 @@ def open_database(path: Path) -> sqlite3.Connection:
     return connection
 
 
+@dataclass(frozen=True, slots=True)
+class _Change:
+    """What a result changes in the store; without the poses of the whole map, since many may wait for the disk."""
+
+    keyframe: Keyframe
+    T_map_base: FloatArray
+    edges: Sequence[GraphEdge]
+    removed: Sequence[int]
+    points: Mapping[int, FloatArray]
+    clock_offset_ns: int
+
+    @classmethod
+    def of(cls, result: BackendResult, clock_offset_ns: int) -> _Change:
+        keyframe, edges = result.keyframe, result.added
+        if edges is None:
+            edges = [edge for edge in result.edges if edge.j == keyframe.id]
+        return cls(keyframe, result.poses[-1].copy(), edges, result.removed, result.points, clock_offset_ns)
+
+
 class MapStore:
     """The thread `store`. Use as a context manager.
 
@@ -117,12 +140,12 @@ class MapStore:
         self._connection = open_database(path)
         self._lock = threading.Lock()
         self._sync_s = sync_s
-        self._queue: queue.Queue[tuple[BackendResult, int] | None] = queue.Queue(QUEUE_LENGTH)
+        self._queue: queue.Queue[_Change | None] = queue.Queue(QUEUE_LENGTH)
         self.map_id = self._start_map(robot, name)
         self.written = 0
         self.dropped = 0
         self.fault = ""
-        self._failed: list[tuple[BackendResult, int]] = []
+        self._failed: list[_Change] = []
         self._thread = threading.Thread(target=self._run, name="store", daemon=True)
 
     def __enter__(self) -> MapStore:
@@ -135,15 +158,21 @@ class MapStore:
         self._connection.close()
 
     def add(self, result: BackendResult, clock_offset_ns: int) -> None:
-        """Keep a result's keyframe and its new edges; never waits for the disk."""
+        """Keep a result's keyframe and new edges, drop what left the graph; never waits for the disk."""
         try:
-            self._queue.put_nowait((result, clock_offset_ns))
+            self._queue.put_nowait(_Change.of(result, clock_offset_ns))
         except queue.Full:
             self.dropped += 1
 
-    def save_poses(self, poses: FloatArray) -> None:
-        """Write the poses, shape (n, 4, 4), that the back-end has corrected since the keyframes were stored."""
-        rows = [(_pack_pose(T), self.map_id, i) for i, T in enumerate(poses)]
+    def save_poses(self, poses: FloatArray, ids: Sequence[int] | None = None) -> None:
+        """Write the poses, shape (n, 4, 4), that the back-end has corrected since the keyframes were stored.
+
+        Args:
+            poses: of keyframes in map.
+            ids: of these keyframes; 0, 1, 2, ... where not given.
+        """
+        keys = range(len(poses)) if ids is None else ids
+        rows = [(_pack_pose(T), self.map_id, key) for key, T in zip(keys, poses, strict=True)]
         with self._lock:
             self._connection.execute("BEGIN IMMEDIATE")
             self._connection.executemany("UPDATE keyframes SET T_map_base = ? WHERE map_id = ? AND id = ?", rows)
@@ -198,29 +227,14 @@ class MapStore:
             for _ in range(taken):
                 self._queue.task_done()
 
-    def _write(self, batch: list[tuple[BackendResult, int]]) -> None:
+    def _write(self, batch: list[_Change]) -> None:
         if not batch:
             return
-        keyframes, edges = [], []
-        for result, offset in batch:
-            keyframe = result.keyframe
-            T_map = result.poses[keyframe.id]
-            keyframes.append(
-                (
-                    self.map_id,
-                    keyframe.id,
-                    keyframe.stamp_ns + offset,
-                    _pack_pose(keyframe.T_odom_base),
-                    _pack_pose(T_map),
-                    pack_points(keyframe.points),
-                )
-            )
-            edges += [_edge_row(self.map_id, edge) for edge in result.edges if edge.j == keyframe.id]
         try:
             with self._lock:
                 self._connection.execute("BEGIN IMMEDIATE")
-                self._connection.executemany("INSERT OR REPLACE INTO keyframes VALUES (?, ?, ?, ?, ?, ?)", keyframes)
-                self._connection.executemany("INSERT INTO edges VALUES (?, ?, ?, ?, ?, ?, ?)", edges)
+                for change in batch:
+                    self._apply(change)
                 self._connection.execute("COMMIT")
         except sqlite3.Error as error:
             # The robot goes on mapping in memory; the batch is tried again with the next one.
@@ -235,6 +249,28 @@ class MapStore:
         self._failed = []
         self.fault = ""
         self.written += len(batch)
+
+
+    def _apply(self, change: _Change) -> None:
+        execute, many, map_id = self._connection.execute, self._connection.executemany, self.map_id
+        keyframe = change.keyframe
+        row = (
+            map_id,
+            keyframe.id,
+            keyframe.stamp_ns + change.clock_offset_ns,
+            _pack_pose(keyframe.T_odom_base),
+            _pack_pose(change.T_map_base),
+            pack_points(keyframe.points),
+        )
+        execute("INSERT OR REPLACE INTO keyframes VALUES (?, ?, ?, ?, ?, ?)", row)
+        gone = [(map_id, key) for key in change.removed]
+        many("DELETE FROM edges WHERE map_id = ? AND j = ?", gone)
+        many("DELETE FROM edges WHERE map_id = ? AND i = ?", gone)
+        many("DELETE FROM keyframes WHERE map_id = ? AND id = ?", gone)
+        edges = [_edge_row(map_id, edge) for edge in change.edges]
+        many("INSERT INTO edges VALUES (?, ?, ?, ?, ?, ?, ?)", edges)
+        points = [(pack_points(xyz), map_id, key) for key, xyz in change.points.items()]
+        many("UPDATE keyframes SET points = ? WHERE map_id = ? AND id = ?", points)
 
 
 def _pack_pose(T: FloatArray) -> bytes:

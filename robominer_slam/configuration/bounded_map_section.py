@@ -19,6 +19,14 @@ class BoundedMapSection(Section):
     full_every: int = parameter(
         200, "1", "keyframes with closures after which the whole graph is solved anyway", low=1, high=100_000
     )
+    sure_span: int = parameter(
+        4, "1", "keyframes since an accepted closure for which odometry, 1 m of it, is as sure as closures are",
+        low=0, high=100,
+    )  # fmt: skip
+    sure_spacing: int = parameter(
+        2, "1", "of so many sure keyframes one is matched, with one pass: patches of 0.5 m share the rest", low=1,
+        high=100,
+    )  # fmt: skip
     refresh: int = parameter(
         16, "1", "keyframes after which covariances take new closures in: 4 m; until then they are too large",
         low=1, high=10_000,

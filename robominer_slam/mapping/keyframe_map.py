@@ -1,8 +1,11 @@
-"""The map as a set of keyframes: poses that the back-end corrects, points that never change in their own frame."""
+"""The map as a set of keyframes: poses that the back-end corrects, points that stay in their own frame.
+
+Where the back-end bounds the map, keyframes leave, hand their points to a neighbour, or have none of their own.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +35,10 @@ class KeyframeMap:
 
     Attributes:
         version: grows whenever something changed.
+        keyframes: in the order of their ids; some ids are missing where the back-end has taken keyframes out.
+        poses: of them, shape (n, 4, 4).
+        edges: between them.
+        closures: number of loop closures among these.
     """
 
     def __init__(self, point_voxel: float) -> None:
@@ -40,13 +47,20 @@ class KeyframeMap:
         self.keyframes: list[MapKeyframe] = []
         self.poses: FloatArray = np.zeros((0, 4, 4))
         self.edges: Sequence[GraphEdge] = ()
+        self.closures = 0
 
     def take(self, result: BackendResult) -> MapKeyframe:
-        """Take a result of the back-end: a new keyframe, and poses for all."""
+        """Take a result of the back-end: a new keyframe, poses for all, what has gone or lost its points."""
         keyframe = self._thinned(result.keyframe)
         self.keyframes.append(keyframe)
+        if result.removed:
+            gone = set(result.removed)
+            self.keyframes = [k for k in self.keyframes if k.id not in gone]
+        if result.points:
+            self._replace_points(result.points)
         self.poses = result.poses
         self.edges = result.edges
+        self.closures = sum(edge.kind == "loop" for edge in self.edges)
         self.version += 1
         return keyframe
 
@@ -55,12 +69,13 @@ class KeyframeMap:
         self.keyframes = []
         self.poses = np.zeros((0, 4, 4))
         self.edges = ()
+        self.closures = 0
         self.version += 1
 
     @property
-    def closures(self) -> int:
-        """Number of loop closures in the graph."""
-        return sum(edge.kind == "loop" for edge in self.edges)
+    def ids(self) -> list[int]:
+        """Ids of the keyframes, growing."""
+        return [keyframe.id for keyframe in self.keyframes]
 
     def cloud(self) -> FloatArray:
         """All points in map, shape (m, 3), m."""
@@ -69,6 +84,13 @@ class KeyframeMap:
             for T, keyframe in zip(self.poses, self.keyframes, strict=True)
         ]
         return np.concatenate(parts) if parts else np.zeros((0, 3))
+
+    def _replace_points(self, changed: Mapping[int, FloatArray]) -> None:
+        for place, old in enumerate(self.keyframes):
+            points = changed.get(old.id)
+            if points is not None:
+                thinned = voxel_filter(points, self._voxel).astype(np.float32)
+                self.keyframes[place] = MapKeyframe(old.id, old.stamp_ns, thinned)
 
     def _thinned(self, keyframe: Keyframe) -> MapKeyframe:
         points = voxel_filter(keyframe.points, self._voxel)

@@ -37,7 +37,7 @@ MAX_PAYLOAD_BYTES = 512 * 1024
 
 
 class SourceKeyframe(Protocol):
-    """What the encoder needs of a keyframe; its points (m, 3), m, in base_link never change."""
+    """What the encoder needs of a keyframe; its points (m, 3), m, in base_link are another array when they change."""
 
     @property
     def id(self) -> int:
@@ -68,6 +68,9 @@ class MapStreamEncoder:
         """
         self.state = MapState(map_id)
         self.points_left_out = 0
+        self._sources: dict[int, NDArray[np.floating]] = {}
+        self._sent_ids: list[int] = []
+        self._sent_poses = np.zeros((0, 7), dtype=np.int32)
         self._epoch = secrets.randbits(32)
 
     def update(
@@ -90,18 +93,20 @@ class MapStreamEncoder:
         """
         if version <= self.state.version:
             raise ValueError(f"map version {version} after {self.state.version}")
-        quantised = map_state.quantise_poses(poses).tolist()
+        quantised = map_state.quantise_poses(poses)
         if len(quantised) != len(keyframes):
             raise ValueError(f"{len(quantised)} poses of {len(keyframes)} keyframes")
         base = self.state.version
         records: list[Record] = []
-        here: set[int] = set()
-        for source, pose in zip(keyframes, quantised, strict=True):
-            here.add(source.id)
-            records += self._take(source, tuple(pose), clock_offset_ns)
-        for gone in sorted(self.state.keyframes.keys() - here):
+        ids = [source.id for source in keyframes]
+        for place in self._changed(keyframes, ids, quantised):
+            records += self._take(keyframes[place], tuple(quantised[place].tolist()), clock_offset_ns)
+        for gone in sorted(self.state.keyframes.keys() - set(ids)):
             del self.state.keyframes[gone]
+            del self._sources[gone]
             records.append(RemoveRecord(gone))
+        self._sent_ids = ids
+        self._sent_poses = np.array([self.state.keyframes[key].pose for key in ids], dtype=np.int32).reshape(-1, 7)
         self.state.version = version
         return self._messages(Kind.UPDATE, base, records)
 
@@ -121,15 +126,28 @@ class MapStreamEncoder:
             payloads[-1] += message
         return payloads
 
+    def _changed(
+        self, keyframes: Sequence[SourceKeyframe], ids: list[int], poses: NDArray[np.int32]
+    ) -> Iterable[int]:
+        """Places of keyframes that are new, have moved or have other points: few of thousands."""
+        common = 0
+        while common < min(len(ids), len(self._sent_ids)) and ids[common] == self._sent_ids[common]:
+            common += 1
+        moved = _moved(self._sent_poses[:common], poses[:common])
+        for place, (source, key) in enumerate(zip(keyframes, ids, strict=True)):
+            if place >= common or moved[place] or self._sources.get(key) is not source.points:
+                yield place
+
     def _take(self, source: SourceKeyframe, pose: tuple[int, ...], clock_offset_ns: int) -> Iterable[Record]:
         known = self.state.keyframes.get(source.id)
-        if known is None:
+        if known is None or self._sources[source.id] is not source.points:
+            self._sources[source.id] = source.points
             points, left_out = map_state.quantise_points(source.points)
             self.points_left_out += left_out
             new = map_state.keyframe(source.stamp_ns + clock_offset_ns, pose, points)
             self.state.keyframes[source.id] = new
             return _new_keyframe(source.id, new)
-        if not _moved(known.pose, pose):
+        if not _moved(np.array([known.pose]), np.array([pose]))[0]:
             return ()
         self.state.keyframes[source.id] = replace(known, pose=pose)
         return (PoseRecord(source.id, pose),)
@@ -153,10 +171,10 @@ def _new_keyframe(key: int, keyframe: map_state.StreamKeyframe) -> Iterator[Reco
         yield PointsRecord(key, keyframe.points)
 
 
-def _moved(old: tuple[int, ...], new: tuple[int, ...]) -> bool:
-    limit = POSITION_TOLERANCE * map_state.MILLIMETRES_PER_METRE
-    if any(abs(a - b) >= limit for a, b in zip(old[:3], new[:3], strict=True)):
-        return True
+def _moved(old: NDArray[np.int32], new: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """Which poses, shape (n, 7), have moved enough to be sent again, shape (n,)."""
+    off = np.abs(new.astype(np.int64) - old)
+    far = off[:, :3] >= POSITION_TOLERANCE * map_state.MILLIMETRES_PER_METRE
     # A small turn by an angle changes the quaternion by half of it.
-    limit = 0.5 * ANGLE_TOLERANCE * map_state.QUATERNION_UNIT
-    return any(abs(a - b) >= limit for a, b in zip(old[3:], new[3:], strict=True))
+    turned = off[:, 3:] >= 0.5 * ANGLE_TOLERANCE * map_state.QUATERNION_UNIT
+    return np.asarray(far.any(axis=1) | turned.any(axis=1))

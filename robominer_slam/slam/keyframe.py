@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,4 +89,13 @@ class Backend(Protocol):
 
     def process(self, keyframe: Keyframe) -> BackendResult:
         """Add a keyframe, search for loop closures, optimise."""
+        ...
+
+
+@runtime_checkable
+class ReleasesMemory(Protocol):
+    """A back-end with memory that must be freed in the thread that made it."""
+
+    def release(self) -> None:
+        """Free it; the back-end is not used again."""
         ...

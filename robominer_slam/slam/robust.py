@@ -65,6 +65,7 @@ class RobustBackend:
         self._tracked = TrackedCovariance(self._graph, bounds.refresh)
         self._published = PublishedEdges()
         self._since_full = 0
+        self._searched = self._closed = -1
         self._pending: list[Closure] = []
         self._recent: list[Closure] = []
         self._last: Keyframe | None = None
@@ -76,7 +77,7 @@ class RobustBackend:
         """Add a keyframe, search for loop closures, optimise."""
         self._map.begin(keyframe.id)
         self._add_node(keyframe)
-        accepted = self._agreed(self._found(keyframe)) if self._parameters.closure.enabled else []
+        accepted = self._agreed(self._found(keyframe)) if self._is_searched(keyframe.id) else []
         for closure in accepted:
             self._add_loop(closure)
         if accepted:
@@ -150,8 +151,20 @@ class RobustBackend:
 
     # --------------------------------------------------------------------------------------------- closures
 
+    def _is_searched(self, key: int) -> bool:
+        """Whether closures are searched at all, and this keyframe's turn has come."""
+        if not self._parameters.closure.enabled:
+            return False
+        return key - self._searched >= self._parameters.bounds.sure_spacing or not self._is_sure(key)
+
+    def _is_sure(self, key: int) -> bool:
+        """Whether one closure now and then will do: the graph is large, and a closure has just held it here."""
+        bounds = self._parameters.bounds
+        return len(self._graph.nodes) > bounds.local_window and key - self._closed <= bounds.sure_span
+
     def _found(self, keyframe: Keyframe) -> list[Closure]:
         """Closures of a keyframe that pass every check of their own."""
+        self._searched = keyframe.id
         source, oldest = self._source(keyframe)
         if len(source) < LEAST_POINTS:
             return []
@@ -159,7 +172,8 @@ class RobustBackend:
         sigma = float(np.sqrt(np.linalg.eigvalsh(self._predicted_covariance()[:2, :2])[-1]))
         reach = self._parameters.closure.sigmas * sigma
         found = []
-        for ids in self._search.passes(k, self._outlines(reach), nodes, reach):
+        passes = self._search.passes(k, self._outlines(reach), nodes, reach)
+        for ids in passes[:1] if self._is_sure(k) else passes:
             anchor = min(ids, key=lambda i: float(np.hypot(*graph.relative(i, k)[:2])))
             covariance = self._tracked.relative(anchor)
             closure = self._search.find(
@@ -256,6 +270,7 @@ class RobustBackend:
         """Optimise as much of the graph as the new closures ask for."""
         bounds, graph = self._parameters.bounds, self._graph
         self.closures.counts["accepted"] += len(accepted)
+        self._closed = max(closure.j for closure in accepted)
         self._since_full += 1
         large = self._since_full >= bounds.full_every or any(self._is_far(closure) for closure in accepted)
         if not large and len(graph.nodes) > bounds.local_window:
