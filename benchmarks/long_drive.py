@@ -76,7 +76,14 @@ def corridor(rng: np.random.Generator) -> Iterator[FloatArray]:
             yield np.array([x, rng.uniform(-1.5, 1.5)])
 
 
-AREAS = {"yard": yard, "corridor": corridor}
+def rounds(rng: np.random.Generator) -> Iterator[FloatArray]:
+    """Round and round four corners 2.5 m apart, never quite the same way: for tests."""
+    while True:
+        for corner in ((2.5, 0.0), (2.5, 2.5), (0.0, 2.5), (0.0, 0.0)):
+            yield np.array(corner) + rng.uniform(-0.15, 0.15, 2)
+
+
+AREAS = {"rounds": rounds, "yard": yard, "corridor": corridor}
 
 
 def drive(area: str, seed: int, count: int) -> Iterator[tuple[Keyframe, FloatArray]]:

@@ -26,7 +26,7 @@ class SqlitePages:
     def write(self, key: int, points: FloatArray) -> None:
         """Keep the touches of a keyframe, shape (m, 3), m, as float32."""
         data = np.asarray(points, dtype="<f4").tobytes()
-        self._opened().execute("INSERT OR REPLACE INTO patches VALUES (?, ?)", (key, data))
+        self._do("INSERT OR REPLACE INTO patches VALUES (?, ?)", (key, data))
 
     def read(self, key: int) -> FloatArray:
         """Touches that were written, shape (m, 3), m.
@@ -34,20 +34,27 @@ class SqlitePages:
         Raises:
             KeyError: nothing was written under this key.
         """
-        row = self._opened().execute("SELECT points FROM patches WHERE id = ?", (key,)).fetchone()
+        row = self._do("SELECT points FROM patches WHERE id = ?", (key,))
         if row is None:
             raise KeyError(key)
         return np.frombuffer(row[0], dtype="<f4").reshape(-1, 3).astype(np.float64)
 
     def delete(self, key: int) -> None:
         """Let go of a keyframe's touches; SQLite uses the room again."""
-        self._opened().execute("DELETE FROM patches WHERE id = ?", (key,))
+        self._do("DELETE FROM patches WHERE id = ?", (key,))
 
     def close(self) -> None:
         """Let go of the file; must not be used again."""
         if self._connection is not None:
             self._connection.close()
             self._connection = None
+
+    def _do(self, statement: str, values: tuple[int | bytes, ...]) -> tuple[bytes] | None:
+        try:
+            row: tuple[bytes] | None = self._opened().execute(statement, values).fetchone()
+        except sqlite3.Error as error:
+            raise OSError(f"touches cannot be paged to disk: {error}") from error
+        return row
 
     def _opened(self) -> sqlite3.Connection:
         if self._connection is None:

@@ -8,6 +8,10 @@ from robominer_slam.configuration.parameter import Section, parameter
 class BoundedMapSection(Section):
     """What is optimised, and what is kept, however long the drive."""
 
+    small_map: int = parameter(
+        200, "1", "keyframes, 50 m, up to which all are matched with all passes and keep their touches", low=0,
+        high=1_000_000,
+    )  # fmt: skip
     local_window: int = parameter(
         100, "1", "keyframes that move where closures agree; graphs no larger are always solved whole",
         low=10, high=100_000,

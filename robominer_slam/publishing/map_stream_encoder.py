@@ -99,14 +99,20 @@ class MapStreamEncoder:
         base = self.state.version
         records: list[Record] = []
         ids = [source.id for source in keyframes]
-        for place in self._changed(keyframes, ids, quantised):
-            records += self._take(keyframes[place], tuple(quantised[place].tolist()), clock_offset_ns)
+        common = _common_length(ids, self._sent_ids)
+        sent = quantised.copy()
+        moved = np.ones(len(ids), dtype=np.bool_)
+        moved[:common] = _moved(self._sent_poses[:common], quantised[:common])
+        sent[:common][~moved[:common]] = self._sent_poses[:common][~moved[:common]]
+        for place, (source, changed) in enumerate(zip(keyframes, moved.tolist(), strict=True)):
+            if changed or self._sources.get(source.id) is not source.points:
+                records += self._take(source, tuple(quantised[place].tolist()), clock_offset_ns)
+                sent[place] = self.state.keyframes[source.id].pose
         for gone in sorted(self.state.keyframes.keys() - set(ids)):
             del self.state.keyframes[gone]
             del self._sources[gone]
             records.append(RemoveRecord(gone))
-        self._sent_ids = ids
-        self._sent_poses = np.array([self.state.keyframes[key].pose for key in ids], dtype=np.int32).reshape(-1, 7)
+        self._sent_ids, self._sent_poses = ids, sent
         self.state.version = version
         return self._messages(Kind.UPDATE, base, records)
 
@@ -125,18 +131,6 @@ class MapStreamEncoder:
                 payloads.append(b"")
             payloads[-1] += message
         return payloads
-
-    def _changed(
-        self, keyframes: Sequence[SourceKeyframe], ids: list[int], poses: NDArray[np.int32]
-    ) -> Iterable[int]:
-        """Places of keyframes that are new, have moved or have other points: few of thousands."""
-        common = 0
-        while common < min(len(ids), len(self._sent_ids)) and ids[common] == self._sent_ids[common]:
-            common += 1
-        moved = _moved(self._sent_poses[:common], poses[:common])
-        for place, (source, key) in enumerate(zip(keyframes, ids, strict=True)):
-            if place >= common or moved[place] or self._sources.get(key) is not source.points:
-                yield place
 
     def _take(self, source: SourceKeyframe, pose: tuple[int, ...], clock_offset_ns: int) -> Iterable[Record]:
         known = self.state.keyframes.get(source.id)
@@ -169,6 +163,14 @@ def _new_keyframe(key: int, keyframe: map_state.StreamKeyframe) -> Iterator[Reco
     yield KeyframeRecord(key, keyframe.stamp_ns, keyframe.pose, len(keyframe.points))
     if len(keyframe.points):
         yield PointsRecord(key, keyframe.points)
+
+
+def _common_length(a: list[int], b: list[int]) -> int:
+    """How many ids two lists have in common at their beginning."""
+    shorter = min(len(a), len(b))
+    if a[:shorter] == b[:shorter]:
+        return shorter
+    return next(k for k in range(shorter) if a[k] != b[k])
 
 
 def _moved(old: NDArray[np.int32], new: NDArray[np.int32]) -> NDArray[np.bool_]:

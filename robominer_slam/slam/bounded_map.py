@@ -31,6 +31,8 @@ FloatArray = NDArray[np.float64]
 
 #: Keyframes that leave at once where too many are there: what each costs is shared by these.
 BATCH = 16
+#: Keyframes whose touches are judged at one keyframe at most: those of a small map wait until it is large.
+DECISIONS = 2
 #: Ground is looked for among keyframes this much farther than the touches reach, m: as far as others' touches reach.
 GROUND_REACH = 0.6
 
@@ -76,7 +78,9 @@ class BoundedMap:
             min_travel: way since which ground counts as mapped before, m.
         """
         nodes = self._graph.nodes
-        while self._undecided:
+        if len(nodes) <= self._bounds.small_map:
+            return
+        for _ in range(min(DECISIONS, len(self._undecided))):
             key = self._undecided[0]
             row = nodes.row(key)
             if newest - key <= partner_span or nodes.travelled[-1] - nodes.travelled[row] < patch:

@@ -19,7 +19,7 @@ FloatArray = NDArray[np.float64]
 
 
 class PatchPages(Protocol):
-    """Where touches wait; only what was written is read."""
+    """Where touches wait; only what was written is read. All of it may raise OSError."""
 
     def write(self, key: int, points: FloatArray) -> None:
         """Keep the touches of a keyframe, shape (m, 3), m, to a tenth of a millimetre or better."""
@@ -44,6 +44,7 @@ class PatchMemory(Mapping[int, Patch]):
     Attributes:
         points_in_memory: touches that memory holds now.
         fetched: patches that were read back.
+        fault: why nothing is paged any more, and memory grows instead; empty if all is well.
     """
 
     def __init__(self, max_points: int, pages: PatchPages | None) -> None:
@@ -54,6 +55,7 @@ class PatchMemory(Mapping[int, Patch]):
         self._written: set[int] = set()
         self.points_in_memory = 0
         self.fetched = 0
+        self.fault = ""
 
     def __setitem__(self, key: int, patch: Patch) -> None:
         self.pop(key)
@@ -64,10 +66,7 @@ class PatchMemory(Mapping[int, Patch]):
         if patch is not None:
             self._here.move_to_end(key)
             return patch
-        travelled = self._away.pop(key)
-        assert self._pages is not None
-        self.fetched += 1
-        patch = Patch(self._pages.read(key), travelled)
+        patch = Patch(self._read(key), self._away.pop(key))
         self._take_in(key, patch)
         return patch
 
@@ -88,16 +87,43 @@ class PatchMemory(Mapping[int, Patch]):
         self._away.pop(key, None)
         if key in self._written:
             self._written.discard(key)
-            assert self._pages is not None
-            self._pages.delete(key)
+            self._delete(key)
 
     def _take_in(self, key: int, patch: Patch) -> None:
         self._here[key] = patch
         self.points_in_memory += len(patch.points)
-        while self._pages is not None and self.points_in_memory > self._max_points and len(self._here) > 1:
+        while self.points_in_memory > self._max_points and len(self._here) > 1 and self._write(next(iter(self._here))):
             oldest, gone = self._here.popitem(last=False)
             self.points_in_memory -= len(gone.points)
             self._away[oldest] = gone.travelled
-            if oldest not in self._written:
-                self._pages.write(oldest, gone.points)
-                self._written.add(oldest)
+
+    def _write(self, key: int) -> bool:
+        """Whether a patch is in the pages."""
+        if key in self._written:
+            return True
+        if self._pages is None or self.fault:
+            return False
+        try:
+            self._pages.write(key, self._here[key].points)
+        except OSError as error:
+            self.fault = str(error)
+            return False
+        self._written.add(key)
+        return True
+
+    def _read(self, key: int) -> FloatArray:
+        """Touches that are away; none where they cannot be read: ground that is not known is not matched with."""
+        assert self._pages is not None
+        self.fetched += 1
+        try:
+            return self._pages.read(key)
+        except OSError as error:
+            self.fault = str(error)
+            return np.zeros((0, 3))
+
+    def _delete(self, key: int) -> None:
+        assert self._pages is not None
+        try:
+            self._pages.delete(key)
+        except OSError as error:
+            self.fault = str(error)

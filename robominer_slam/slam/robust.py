@@ -160,7 +160,7 @@ class RobustBackend:
     def _is_sure(self, key: int) -> bool:
         """Whether one closure now and then will do: the graph is large, and a closure has just held it here."""
         bounds = self._parameters.bounds
-        return len(self._graph.nodes) > bounds.local_window and key - self._closed <= bounds.sure_span
+        return len(self._graph.nodes) > bounds.small_map and key - self._closed <= bounds.sure_span
 
     def _found(self, keyframe: Keyframe) -> list[Closure]:
         """Closures of a keyframe that pass every check of their own."""
