@@ -148,6 +148,7 @@ class Block:
     map_ms: list[float] = field(default_factory=list)
     errors_m: list[float] = field(default_factory=list)
     resident_mb: float = 0.0
+    points: int = 0
     nodes: int = 0
     edges: int = 0
 
@@ -155,14 +156,14 @@ class Block:
         """A row of the table."""
         backend = np.array(self.backend_ms)
         return (
-            f"{self.last:>9} {self.nodes:>6} {self.edges:>6} {self.resident_mb:>8.1f} {backend.mean():>8.1f} "
+            f"{self.last:>9} {self.nodes:>6} {self.edges:>6} {self.points:>8} {self.resident_mb:>8.1f} {backend.mean():>8.1f} "
             f"{np.percentile(backend, 99):>8.1f} {backend.max():>8.1f} {np.mean(self.map_ms):>7.2f} "
             f"{np.mean(self.errors_m):>8.3f} {np.max(self.errors_m):>8.3f}"
         )
 
 
 HEAD = (
-    f"{'keyframes':>9} {'nodes':>6} {'edges':>6} {'RSS MB':>8} {'mean ms':>8} {'p99 ms':>8} {'max ms':>8} {'map ms':>7} "
+    f"{'keyframes':>9} {'nodes':>6} {'edges':>6} {'points':>8} {'RSS MB':>8} {'mean ms':>8} {'p99 ms':>8} {'max ms':>8} {'map ms':>7} "
     f"{'error m':>8} {'worst m':>8}"
 )
 
@@ -184,6 +185,7 @@ def run(area: str, seed: int, count: int, block: int, parameters: RobustSlamSect
         if (keyframe.id + 1) % block == 0 or keyframe.id + 1 == count:
             current.last, current.resident_mb = keyframe.id + 1, resident_mb()
             current.nodes, current.edges = len(result.poses), len(result.edges)
+            current.points = sum(len(one.points) for one in keyframes.keyframes)
             yield current
             current = Block(0)
 

@@ -42,7 +42,7 @@ class BoundedMapSection(Section):
         0.04, "m", "touches this near cover: lines of touches are 32 mm apart", low=0.005, high=0.5
     )
     max_keyframes: int = parameter(
-        1500, "1", "of the graph: solving all of it takes 40 ms on a desktop, 1 s on the board", low=50, high=1_000_000
+        1000, "1", "of the graph: solving all of it takes 25 ms on a desktop, 0.6 s on the board", low=50, high=1_000_000
     )
     merge_extent: float = parameter(
         1.0, "m", "way that merged keyframes span at most: their drift within is no longer corrected", low=0.0,

@@ -162,6 +162,12 @@ class RobustBackend:
         bounds = self._parameters.bounds
         return len(self._graph.nodes) > bounds.small_map and key - self._closed <= bounds.sure_span
 
+    def _chosen(self, key: int, passes: list[list[int]]) -> list[list[int]]:
+        """Passes to match with: all in a small map; else one, the nearest or, where that may not do, each in turn."""
+        if len(self._graph.nodes) <= self._parameters.bounds.small_map or len(passes) < 2:
+            return passes
+        return passes[:1] if self._is_sure(key) else [passes[key % len(passes)]]
+
     def _found(self, keyframe: Keyframe) -> list[Closure]:
         """Closures of a keyframe that pass every check of their own."""
         self._searched = keyframe.id
@@ -172,8 +178,7 @@ class RobustBackend:
         sigma = float(np.sqrt(np.linalg.eigvalsh(self._predicted_covariance()[:2, :2])[-1]))
         reach = self._parameters.closure.sigmas * sigma
         found = []
-        passes = self._search.passes(k, self._outlines(reach), nodes, reach)
-        for ids in passes[:1] if self._is_sure(k) else passes:
+        for ids in self._chosen(k, self._search.passes(k, self._outlines(reach), nodes, reach)):
             anchor = min(ids, key=lambda i: float(np.hypot(*graph.relative(i, k)[:2])))
             covariance = self._tracked.relative(anchor)
             closure = self._search.find(
