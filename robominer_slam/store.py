@@ -14,7 +14,7 @@ import sqlite3
 import threading
 import time
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robominer_slam import geometry
-from robominer_slam.slam.keyframe import BackendResult, GraphEdge, Keyframe
+from robominer_slam.slam.keyframe import BackendResult, GraphEdge, Keyframe, Merge
 
 log = logging.getLogger(__name__)
 
@@ -116,7 +116,8 @@ class _Change:
     T_map_base: FloatArray
     edges: Sequence[GraphEdge]
     removed: Sequence[int]
-    points: Mapping[int, FloatArray]
+    merged: Sequence[Merge]
+    bare: Sequence[int]
     clock_offset_ns: int
 
     @classmethod
@@ -124,7 +125,8 @@ class _Change:
         keyframe, edges = result.keyframe, result.added
         if edges is None:
             edges = [edge for edge in result.edges if edge.j == keyframe.id]
-        return cls(keyframe, result.poses[-1].copy(), edges, result.removed, result.points, clock_offset_ns)
+        pose = result.poses[-1].copy()
+        return cls(keyframe, pose, edges, result.removed, result.merged, result.bare, clock_offset_ns)
 
 
 class MapStore:
@@ -263,14 +265,30 @@ class MapStore:
             pack_points(keyframe.points),
         )
         execute("INSERT OR REPLACE INTO keyframes VALUES (?, ?, ?, ?, ?, ?)", row)
+        for merge in change.merged:
+            self._merge(merge)
+        many("UPDATE keyframes SET points = ? WHERE map_id = ? AND id = ?",
+             [(pack_points(np.zeros((0, 3))), map_id, key) for key in change.bare])  # fmt: skip
         gone = [(map_id, key) for key in change.removed]
         many("DELETE FROM edges WHERE map_id = ? AND j = ?", gone)
         many("DELETE FROM edges WHERE map_id = ? AND i = ?", gone)
         many("DELETE FROM keyframes WHERE map_id = ? AND id = ?", gone)
         edges = [_edge_row(map_id, edge) for edge in change.edges]
         many("INSERT INTO edges VALUES (?, ?, ?, ?, ?, ?, ?)", edges)
-        points = [(pack_points(xyz), map_id, key) for key, xyz in change.points.items()]
-        many("UPDATE keyframes SET points = ? WHERE map_id = ? AND id = ?", points)
+
+    def _merge(self, merge: Merge) -> None:
+        """Points of a keyframe into the frame of another."""
+        execute = self._connection.execute
+        found = execute(
+            "SELECT id, points FROM keyframes WHERE map_id = ? AND id IN (?, ?)", (self.map_id, merge.into, merge.gone)
+        )
+        points = {key: unpack_points(data) for key, data in found}
+        if len(points) == 2:
+            moved = geometry.transform_points(merge.T_into_gone, points[merge.gone])
+            packed = pack_points(np.concatenate([points[merge.into], moved]))
+            execute(
+                "UPDATE keyframes SET points = ? WHERE map_id = ? AND id = ?", (packed, self.map_id, merge.into)
+            )
 
 
 def _pack_pose(T: FloatArray) -> bytes:

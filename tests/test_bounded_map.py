@@ -258,17 +258,17 @@ def test_removed_keyframes_vanish_from_map_graph_and_stream():
     backend, whole = RobustBackend(small_bounds(), SqlitePages()), KeyframeMap(0.01)
     encoder, decoder = MapStreamEncoder(7), MapStreamDecoder()
     removed: set[int] = set()
-    changed: set[int] = set()
+    bare: set[int] = set()
     for keyframe, _ in rounds(180):
         result = backend.process(keyframe)
         whole.take(result)
         removed |= set(result.removed)
-        changed |= set(result.points)
+        bare |= set(result.bare)
         vectors = geometry.to_vector7(whole.poses)
         for message in encoder.update(whole.version, whole.keyframes, vectors):
             decoder.feed(message)
     assert len(removed) > 80
-    assert changed
+    assert bare
     ids = [k.id for k in whole.keyframes]
     assert not set(ids) & removed
     assert ids == sorted(ids)
@@ -284,6 +284,7 @@ def test_removed_keyframes_vanish_from_map_graph_and_stream():
     for keyframe in whole.keyframes:
         assert len(decoder.state.keyframes[keyframe.id].points) <= len(keyframe.points)
         assert bool(len(keyframe.points)) == bool(len(decoder.state.keyframes[keyframe.id].points))
+        assert bool(len(keyframe.points)) == (keyframe.id not in bare)
 
 
 def test_small_maps_are_solved_whole_and_keep_everything():

@@ -5,8 +5,8 @@ Where the back-end bounds the map, keyframes leave, hand their points to a neigh
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,11 +53,8 @@ class KeyframeMap:
         """Take a result of the back-end: a new keyframe, poses for all, what has gone or lost its points."""
         keyframe = self._thinned(result.keyframe)
         self.keyframes.append(keyframe)
-        if result.removed:
-            gone = set(result.removed)
-            self.keyframes = [k for k in self.keyframes if k.id not in gone]
-        if result.points:
-            self._replace_points(result.points)
+        if result.removed or result.bare:
+            self._let_go(result)
         self.poses = result.poses
         self.edges = result.edges
         self.closures = sum(edge.kind == "loop" for edge in self.edges)
@@ -85,12 +82,18 @@ class KeyframeMap:
         ]
         return np.concatenate(parts) if parts else np.zeros((0, 3))
 
-    def _replace_points(self, changed: Mapping[int, FloatArray]) -> None:
-        for place, old in enumerate(self.keyframes):
-            points = changed.get(old.id)
-            if points is not None:
-                thinned = voxel_filter(points, self._voxel).astype(np.float32)
-                self.keyframes[place] = MapKeyframe(old.id, old.stamp_ns, thinned)
+    def _let_go(self, result: BackendResult) -> None:
+        """Points to neighbours, then keyframes out."""
+        by_id = {keyframe.id: keyframe for keyframe in self.keyframes}
+        for merge in result.merged:
+            into, moved = by_id[merge.into], geometry.transform_points(merge.T_into_gone, by_id[merge.gone].points)
+            points = voxel_filter(np.concatenate([into.points, moved]).astype(np.float64), self._voxel)
+            by_id[merge.into] = replace(into, points=points.astype(np.float32))
+        for key in result.bare:
+            by_id[key] = replace(by_id[key], points=np.zeros((0, 3), dtype=np.float32))
+        for key in result.removed:
+            del by_id[key]
+        self.keyframes = list(by_id.values())
 
     def _thinned(self, keyframe: Keyframe) -> MapKeyframe:
         points = voxel_filter(keyframe.points, self._voxel)

@@ -12,10 +12,12 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
+from robominer_slam import geometry
 from robominer_slam.configuration.bounded_map_section import BoundedMapSection
 from robominer_slam.slam.closure_search import Patch
 from robominer_slam.slam.composite_scan import voxel_filter
 from robominer_slam.slam.covered_ground import covered_share
+from robominer_slam.slam.keyframe import Merge
 from robominer_slam.slam.keyframe_graph import KeyframeGraph
 from robominer_slam.slam.keyframe_removal import (
     covered,
@@ -47,8 +49,9 @@ class BoundedMap:
         point_voxel: touches of a keyframe closer than this are one, m.
 
     Attributes:
-        points: touches in base_link, shape (m, 3), m, of keyframes whose touches have changed since `begin`, by id.
         removed: ids of keyframes that have left the graph since `begin`.
+        merged: which of these handed their touches to a neighbour, in order.
+        bare: ids of keyframes that have lost their touches since `begin`.
     """
 
     def __init__(
@@ -60,13 +63,20 @@ class BoundedMap:
         self._voxel = point_voxel
         self._undecided: deque[int] = deque()
         self._spans: dict[int, float] = {}
-        self.points: dict[int, FloatArray] = {}
         self.removed: list[int] = []
+        self.merged: list[Merge] = []
+        self.bare: list[int] = []
 
-    def begin(self, key: int) -> None:
-        """A keyframe was added; what `points` and `removed` said of the one before is forgotten."""
-        self._undecided.append(key)
-        self.points, self.removed = {}, []
+    def begin(self, key: int, floor_only: bool) -> None:
+        """A keyframe was added; what the attributes said of the one before is forgotten.
+
+        Args:
+            key: its id.
+            floor_only: whether all its touches are patches of ground: others are kept, since nothing covers them.
+        """
+        if floor_only:
+            self._undecided.append(key)
+        self.removed, self.merged, self.bare = [], [], []
 
     def settle(self, newest: int, patch: float, partner_span: int, min_travel: float) -> None:
         """Drop touches of keyframes that need not be kept any longer for the next patches.
@@ -89,7 +99,7 @@ class BoundedMap:
             if self._closed(key) and self._covered(row, min_travel):
                 nodes.mapped[row] = False
                 self._patches.pop(key)
-                self.points[key] = np.zeros((0, 3))
+                self.bare.append(key)
 
     def shrink(self) -> bool:
         """Let keyframes go where they are too many; True if any went."""
@@ -141,7 +151,11 @@ class BoundedMap:
         points = np.concatenate([self._patches[before].points, placed(self._patches[key].points, shift)])
         points = voxel_filter(points, self._voxel)
         self._patches[before] = Patch(points, float(nodes.travelled[row - 1]))
-        self.points[before] = points @ nodes.tilt(before)
+        T = geometry.T_from_xyyaw(shift[:3])
+        T[2, 3] = shift[3]
+        R_into, R_gone = np.eye(4), np.eye(4)
+        R_into[:3, :3], R_gone[:3, :3] = nodes.tilts[row - 1], nodes.tilts[row]
+        self.merged.append(Merge(key, before, R_into.T @ T @ R_gone))
         step = float(nodes.travelled[row] - nodes.travelled[row - 1])
         self._spans[before] = step + self._spans.get(key, 0.0)
 
@@ -152,7 +166,6 @@ class BoundedMap:
         for key in keys:
             self._patches.pop(key)
             self._spans.pop(key, None)
-            self.points.pop(key, None)
         gone = set(keys)
         self._undecided = deque(key for key in self._undecided if key not in gone)
         self.removed += keys

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -55,6 +55,20 @@ class GraphEdge:
 
 
 @dataclass(frozen=True, slots=True)
+class Merge:
+    """A keyframe whose touches move into the frame of another before it goes.
+
+    Attributes:
+        gone, into: ids.
+        T_into_gone: pose of the one in the other, shape (4, 4).
+    """
+
+    gone: int
+    into: int
+    T_into_gone: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
 class BackendResult:
     """The graph after a keyframe was taken in.
 
@@ -68,8 +82,8 @@ class BackendResult:
         version: grows by one with each result.
         added: edges that were not in the result before; None stands for those that end at the keyframe.
         removed: ids of keyframes that have left the graph with all their edges.
-        points: touches, shape (m, 3), m, in base_link at the keyframe, of keyframes whose touches have changed, by
-            id; none where the map has their ground from others.
+        merged: which of these hand their touches to a neighbour, in order.
+        bare: ids of keyframes that keep no touches: the map has their ground from others.
     """
 
     keyframe: Keyframe
@@ -81,7 +95,8 @@ class BackendResult:
     version: int
     added: Sequence[GraphEdge] | None = None
     removed: Sequence[int] = ()
-    points: Mapping[int, FloatArray] = field(default_factory=dict)
+    merged: Sequence[Merge] = ()
+    bare: Sequence[int] = ()
 
 
 class Backend(Protocol):

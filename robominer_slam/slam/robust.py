@@ -75,7 +75,7 @@ class RobustBackend:
 
     def process(self, keyframe: Keyframe) -> BackendResult:
         """Add a keyframe, search for loop closures, optimise."""
-        self._map.begin(keyframe.id)
+        self._map.begin(keyframe.id, floor_only=True)
         self._add_node(keyframe)
         accepted = self._agreed(self._found(keyframe)) if self._is_searched(keyframe.id) else []
         for closure in accepted:
@@ -350,7 +350,8 @@ class RobustBackend:
             version=self._version,
             added=tuple(self._published.added),
             removed=tuple(self._map.removed),
-            points=self._map.points,
+            merged=tuple(self._map.merged),
+            bare=tuple(self._map.bare),
         )
 
 
