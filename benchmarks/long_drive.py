@@ -156,15 +156,15 @@ class Block:
         """A row of the table."""
         backend = np.array(self.backend_ms)
         return (
-            f"{self.last:>9} {self.nodes:>6} {self.edges:>6} {self.points:>8} {self.resident_mb:>8.1f} {backend.mean():>8.1f} "
-            f"{np.percentile(backend, 99):>8.1f} {backend.max():>8.1f} {np.mean(self.map_ms):>7.2f} "
-            f"{np.mean(self.errors_m):>8.3f} {np.max(self.errors_m):>8.3f}"
+            f"{self.last:>9} {self.nodes:>6} {self.edges:>6} {self.points:>8} {self.resident_mb:>8.1f} "
+            f"{backend.mean():>8.1f} {np.percentile(backend, 99):>8.1f} {backend.max():>8.1f} "
+            f"{np.mean(self.map_ms):>7.2f} {np.mean(self.errors_m):>8.3f} {np.max(self.errors_m):>8.3f}"
         )
 
 
 HEAD = (
-    f"{'keyframes':>9} {'nodes':>6} {'edges':>6} {'points':>8} {'RSS MB':>8} {'mean ms':>8} {'p99 ms':>8} {'max ms':>8} {'map ms':>7} "
-    f"{'error m':>8} {'worst m':>8}"
+    f"{'keyframes':>9} {'nodes':>6} {'edges':>6} {'points':>8} {'RSS MB':>8} "
+    f"{'mean ms':>8} {'p99 ms':>8} {'max ms':>8} {'map ms':>7} {'error m':>8} {'worst m':>8}"
 )
 
 

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from mcap.reader import SeekingReader
 from mcap.records import Channel, Schema
 from mcap.records import Message as McapMessage
 
 from drivers import ground_truth, measurement_messages
 from drivers.counters import Counters
 from drivers.ground_truth import GroundTruth, WhiskerTruth
+from drivers.mcap_order import ordered_messages
 from drivers.mcap_salvage import DAMAGE, Salvage
 from drivers.measurement import Measurement
 from drivers.recording_contents import TopicSummary, read_contents
@@ -179,9 +179,7 @@ class Recording:
 
     def _indexed(self, topics: set[str] | None) -> Iterator[RawMessage]:
         with self.path.open("rb") as file:
-            reader = SeekingReader(file, validate_crcs=True)
-            names = None if topics is None else {t for topic in topics for t in (topic, f"/{topic}")}
-            messages = reader.iter_messages(topics=names, log_time_order=True)
+            messages = ordered_messages(file, topics)
             while True:
                 try:
                     item = next(messages)

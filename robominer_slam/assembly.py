@@ -68,6 +68,7 @@ def build_pipeline(
         composite_scan=composite,
         runner=runner,
         scan_odometry=build_scan_odometry(configuration, layout),
+        points_down=points_down(layout),
         imu_mounts={
             device.name: geometry.matrix_from_rpy(np.deg2rad(device.mount_rpy_deg))
             for device in configuration.device
@@ -99,6 +100,11 @@ def build_slam(
     return composite, SynchronousRunner(backend, latency_ns)
 
 
+def points_down(layout: WhiskerLayout) -> NDArray[np.bool_]:
+    """Whiskers that feel the floor, shape (n,): mounted within 30 degrees of straight down."""
+    return np.asarray(layout.R_base_whisker[:, 2, 2] <= -np.cos(np.deg2rad(30.0)))
+
+
 def build_scan_odometry(configuration: Configuration, layout: WhiskerLayout) -> ScanOdometry | None:
     """Scan matching, for the method that has it."""
     robust = configuration.slam.robust
@@ -106,9 +112,7 @@ def build_scan_odometry(configuration: Configuration, layout: WhiskerLayout) -> 
         return None
     s = robust.surface
     reach = float((np.abs(layout.p_base[:, :2]).max(axis=1) + layout.length).max()) + 0.1
-    return ScanOdometry(
-        robust.scan_matching, SurfaceModel(s.touch_sigma, s.curvature, s.slope_sigma, s.reach), reach
-    )
+    return ScanOdometry(robust.scan_matching, SurfaceModel(s.touch_sigma, s.curvature, s.slope_sigma, s.reach), reach)
 
 
 def build_robust_odometry(configuration: Configuration, layout: WhiskerLayout) -> RobustOdometry:

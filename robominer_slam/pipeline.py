@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import replace
@@ -53,6 +54,8 @@ class Pipeline:
         runner: of the back-end; None for odometry alone.
         imu_mounts: rotation of each device's IMU in base_link, shape (3, 3), by device name.
         reorder_window_ns: see `ReorderBuffer`.
+        scan_odometry: scan matching, for the method that has it.
+        points_down: which whiskers feel the floor, shape (n,); None: all.
     """
 
     def __init__(
@@ -66,6 +69,7 @@ class Pipeline:
         imu_mounts: Mapping[str, FloatArray],
         reorder_window_ns: int,
         scan_odometry: ScanOdometry | None = None,
+        points_down: NDArray[np.bool_] | None = None,
     ) -> None:
         self.reorder = ReorderBuffer(reorder_window_ns)
         self.angle_estimator = angle_estimator
@@ -79,6 +83,7 @@ class Pipeline:
         self._composite = composite_scan
         self._imu_mounts = imu_mounts
         self._scan_odometry = scan_odometry
+        self._points_down = np.ones(angle_estimator.count, dtype=np.bool_) if points_down is None else points_down
         self._T_map_odom = np.eye(4)
         self._last_result: BackendResult | None = None
         self._odometry_at_result: FloatArray | None = None
@@ -161,12 +166,13 @@ class Pipeline:
         if isinstance(self._dead_reckoning, FeelsMotion):
             self._dead_reckoning.add_contacts(stamp, contacts)
             odometry = self._dead_reckoning.state_at(stamp)
-        odometry = self._matched(stamp, odometry, contacts.points)
+        floor = self._points_down[contacts.index]
+        odometry = self._matched(stamp, odometry, contacts.points[floor])
         T_odom_base = planar_pose(odometry)
         backend_results = self.runner.due(stamp) if self.runner is not None else []
         for result in backend_results:
             self._take(result)
-        keyframe = self._keyframe(stamp, T_odom_base, contacts.points, odometry)
+        keyframe = self._keyframe(stamp, T_odom_base, contacts.points, floor, odometry)
         state = self._state(stamp)
         return FrameResult(
             stamp_ns=stamp,
@@ -202,11 +208,16 @@ class Pipeline:
         return odometry
 
     def _keyframe(
-        self, stamp: int, T_odom_base: FloatArray, points: FloatArray, odometry: OdometryState
+        self,
+        stamp: int,
+        T_odom_base: FloatArray,
+        points: FloatArray,
+        floor: NDArray[np.bool_],
+        odometry: OdometryState,
     ) -> Keyframe | None:
         if self._composite is None or self.runner is None or self.paused:
             return None
-        keyframe = self._composite.add(stamp, T_odom_base, points)
+        keyframe = self._composite.add(stamp, T_odom_base, points, floor)
         if keyframe is not None:
             if isinstance(self._dead_reckoning, TellsMotion):
                 keyframe = replace(keyframe, motion=self._dead_reckoning.mark_keyframe(stamp))
@@ -253,11 +264,18 @@ class Pipeline:
             sample,
             gyro=None if sample.gyro is None else R @ sample.gyro,
             acceleration=None if sample.acceleration is None else R @ sample.acceleration,
+            orientation_xyzw=None if sample.orientation_xyzw is None else _turned(sample.orientation_xyzw, R),
         )
+
+
+def _turned(xyzw: FloatArray, R_base_imu: FloatArray) -> FloatArray:
+    """Attitude of base_link from that of an IMU mounted in it."""
+    return geometry.matrix_to_quaternion(geometry.quaternion_to_matrix(xyzw) @ R_base_imu.T)
 
 
 def planar_pose(state: OdometryState) -> FloatArray:
     """Pose of base_link in odom, shape (4, 4): in space where it is known so, else in the plane."""
     if state.T_odom_base is not None:
         return state.T_odom_base
-    return geometry.T_from_xyyaw([state.x, state.y, state.yaw])
+    c, s = math.cos(state.yaw), math.sin(state.yaw)
+    return np.array([[c, -s, 0.0, state.x], [s, c, 0.0, state.y], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])

@@ -64,6 +64,7 @@ class Publisher:
         pose = geometry.to_vector7(result.T_map_base)
         self._bus.put("pose", pose_messages.pose_with_covariance(stamp, MAP, pose, covariance))
         vx, vy, wz = odometry.velocity
+        in_space = odometry.pose_covariance
         self._bus.put(
             "odom",
             pose_messages.odometry(
@@ -71,7 +72,7 @@ class Publisher:
                 ODOM,
                 BASE,
                 odom_pose,
-                full_covariance(odometry.covariance),
+                full_covariance(odometry.covariance) if in_space is None else in_space,
                 np.array([vx, vy, 0.0, 0.0, 0.0, wz]),
                 full_covariance(odometry.velocity_covariance),
             ),

@@ -252,7 +252,6 @@ class MapStore:
         self.fault = ""
         self.written += len(batch)
 
-
     def _apply(self, change: _Change) -> None:
         execute, many, map_id = self._connection.execute, self._connection.executemany, self.map_id
         keyframe = change.keyframe
@@ -286,9 +285,7 @@ class MapStore:
         if len(points) == 2:
             moved = geometry.transform_points(merge.T_into_gone, points[merge.gone])
             packed = pack_points(np.concatenate([points[merge.into], moved]))
-            execute(
-                "UPDATE keyframes SET points = ? WHERE map_id = ? AND id = ?", (packed, self.map_id, merge.into)
-            )
+            execute("UPDATE keyframes SET points = ? WHERE map_id = ? AND id = ?", (packed, self.map_id, merge.into))
 
 
 def _pack_pose(T: FloatArray) -> bytes:

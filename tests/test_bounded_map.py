@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -107,7 +108,8 @@ def test_removal_never_makes_the_graph_surer(gone: list[int]):
 def test_a_keyframe_without_closures_leaves_without_a_trace():
     """Then a composed edge is the exact marginal: poses and covariances of the others stay."""
     graph = circling(160, off=0.002)
-    free = [k for k in range(70, 90) if k not in set(graph.edges.i[graph.edges.loop]) | set(graph.edges.j[graph.edges.loop])]
+    looped = set(graph.edges.i[graph.edges.loop]) | set(graph.edges.j[graph.edges.loop])
+    free = [k for k in range(70, 90) if k not in looped]
     covariance, pose = graph.covariance([159]), graph.nodes[159]
     remove_keyframes(graph, free[:4])
     graph.optimise()
@@ -178,7 +180,7 @@ def test_merging_takes_the_farthest_first_and_never_beyond_the_extent():
     distance = [float(np.hypot(*(graph.nodes[k][:2] - robot))) for k in chosen]
     assert distance[0] == pytest.approx(max(np.hypot(*(graph.nodes.poses[1:90, :2] - robot).T)), abs=0.1)
     assert not mergeable(graph, {}, 0.2, 30, robot)
-    spans = {k: 0.25 for k in range(120)}
+    spans = dict.fromkeys(range(120), 0.25)
     assert not mergeable(graph, spans, 0.3, 30, robot)
 
 
@@ -222,7 +224,7 @@ class TestPatchMemory:
 
     def test_a_failing_disk_costs_memory_and_no_touches(self):
         class Full(SqlitePages):
-            def write(self, key, points):
+            def write(self, _key, _points):
                 raise OSError("No space left on device")
 
         memory = PatchMemory(300, Full())
@@ -277,7 +279,7 @@ def test_removed_keyframes_vanish_from_map_graph_and_stream():
     assert [k["id"] for k in graph["keyframes"]] == ids
     assert {e["i"] for e in graph["edges"]} | {e["j"] for e in graph["edges"]} <= set(ids)
     chain = sorted((e["i"], e["j"]) for e in graph["edges"] if e["kind"] == "odometry")
-    assert chain == list(zip(ids[:-1], ids[1:], strict=True))
+    assert chain == list(pairwise(ids))
     assert decoder.state is not None
     assert decoder.state.digest() == encoder.state.digest()
     assert sorted(decoder.state.keyframes) == ids

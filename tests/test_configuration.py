@@ -44,7 +44,7 @@ def test_every_protocol_prints_and_reads_back_with_its_own_keys_only():
     ("text", "expected"),
     [
         ("[slam]\nmetod = 'none'", "c.toml: slam.metod: unknown key; did you mean 'method'?"),
-        ("[slam]\nmethod = 'best'", "c.toml: slam.method: expected 'thesis' or 'none', found 'best'"),
+        ("[slam]\nmethod = 'best'", "c.toml: slam.method: expected 'robust', 'thesis' or 'none', found 'best'"),
         ("[slam]\nbackend_latency = '12 cm'", "c.toml: slam.backend_latency: expected a number in s, found '12 cm'"),
         ("[slam.thesis]\nkeyframe_distance = 12", "slam.thesis.keyframe_distance: expected less than or equal to 5 m"),
         ("[contact]\nmin_inclination_deg = nan", "contact.min_inclination_deg"),

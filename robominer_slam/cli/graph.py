@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import click
+import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
@@ -14,8 +16,11 @@ from robominer_slam.slam.g2o_format import G2oFormatError, G2oGraph, format_g2o,
 from robominer_slam.slam.pose_graph import OptimizationResult, PoseGraph, PoseGraphError
 from robominer_slam.slam.pose_graph_optimizer import OptimizationOptions
 from robominer_slam.slam.pose_graph_residuals import Convention
+from robominer_slam.slam.robust_optimizer import RobustResult, optimize_robustly
 
 CONVENTIONS: tuple[Convention, ...] = ("gtsam", "g2o")
+#: Rejected loops listed on a terminal; --json has them all.
+_SHOWN = 20
 _MEANING = {"gtsam": "full SE(n) log (GTSAM)", "g2o": "t and theta or q_vec (g2o)"}
 
 
@@ -49,7 +54,12 @@ def pose_graph_of(content: G2oGraph, path: Path) -> PoseGraph:
     return pose_graph
 
 
-@graph.command(epilog="Example: robominer-slam graph optimize intel.g2o --out intel-optimized.g2o --json")
+_EXAMPLES = """\b
+Example: robominer-slam graph optimize intel.g2o --out intel-optimized.g2o --json
+Example: robominer-slam graph optimize intel.g2o --out intel-true-loops.g2o --robust"""
+
+
+@graph.command(epilog=_EXAMPLES)
 @click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 @click.option(
     "--out", type=click.Path(dir_okay=False, path_type=Path), help="Where to write the optimized graph, 17 digits."
@@ -64,27 +74,44 @@ def pose_graph_of(content: G2oGraph, path: Path) -> PoseGraph:
 @click.option(
     "--max-iterations", type=click.IntRange(min=1), default=100, show_default=True, help="Linear solves at most."
 )
+@click.option(
+    "--robust",
+    is_flag=True,
+    help="Tell true loops from wrong ones first. Edges between nodes whose numbers follow each other are odometry and "
+    "stay; loops that disagree with it or with each other are left out, also of the file written.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print the figures as JSON.")
-def optimize(file: Path, out: Path | None, convention: Convention, max_iterations: int, as_json: bool) -> None:
+def optimize(
+    file: Path, out: Path | None, convention: Convention, max_iterations: int, robust: bool, as_json: bool
+) -> None:
     """Optimize the pose graph in FILE (g2o format).
 
-    The first node stays where it is, or those that FIX lines name. chi2 is the sum of e' Omega e over all edges.
+    The first node stays where it is, or those that FIX lines name. chi2 is the sum of e' Omega e over all edges (with
+    --robust, after: over the accepted ones).
     """
     content = read_g2o(file)
     pose_graph = pose_graph_of(content, file)
     before = {name: pose_graph.chi2(name) for name in CONVENTIONS}
+    options = OptimizationOptions(convention=convention, max_iterations=max_iterations)
+    found: RobustResult | None = None
     try:
-        result = pose_graph.optimize(OptimizationOptions(convention=convention, max_iterations=max_iterations))
+        if robust:
+            sequence = np.argsort(np.argsort(content.ids))
+            found = optimize_robustly(pose_graph, options, sequence=sequence)
+            result = found.optimization
+        else:
+            result = pose_graph.optimize(options)
     except PoseGraphError as error:
         raise click.UsageError(f"{file}: {error} (nodes and edges counted from 0 in the file's order)") from error
     after = {name: pose_graph.chi2(name) for name in CONVENTIONS}
     if out is not None:
         try:
-            out.write_text(format_g2o(replace(content, poses=pose_graph.poses)), encoding="utf-8")
+            kept = content if found is None else with_edges(content, found.accepted)
+            out.write_text(format_g2o(replace(kept, poses=pose_graph.poses)), encoding="utf-8")
         except OSError as error:
             raise click.UsageError(f"{out}: cannot be written ({error.strerror})") from error
     if as_json:
-        figures = {
+        figures: dict[str, object] = {
             "file": str(file),
             "out": None if out is None else str(out),
             "dimension": content.dim,
@@ -97,13 +124,62 @@ def optimize(file: Path, out: Path | None, convention: Convention, max_iteration
             "converged": result.converged,
             "seconds": result.seconds,
         }
+        if found is not None:
+            figures |= _robust_figures(content, found)
         click.echo(json.dumps(figures))
     else:
         _print_table(pose_graph, convention, before, after, result)
+        if found is not None:
+            _print_rejected(content, found)
     if not result.converged:
         raise click.ClickException(
             f"{file}: not converged after {result.iterations} iterations; raise --max-iterations or start nearer"
         )
+
+
+def with_edges(content: G2oGraph, chosen: NDArray[np.bool_]) -> G2oGraph:
+    """The graph with all its nodes, and only the chosen edges, shape (m,)."""
+    return replace(
+        content,
+        i=content.i[chosen],
+        j=content.j[chosen],
+        measurements=content.measurements[chosen],
+        information=content.information[chosen],
+    )
+
+
+def _rejected(content: G2oGraph, found: RobustResult) -> list[list[int]]:
+    """Numbers in the file of the nodes (i, j) of the rejected edges, in the file's order."""
+    out = ~found.accepted
+    i, j = content.ids[content.i[out]].tolist(), content.ids[content.j[out]].tolist()
+    return [[a, b] for a, b in zip(i, j, strict=True)]
+
+
+def _robust_figures(content: G2oGraph, found: RobustResult) -> dict[str, object]:
+    loops = ~found.odometry
+    return {
+        "robust": True,
+        "odometry_edges": int(found.odometry.sum()),
+        "loops": int(loops.sum()),
+        "accepted_loops": int((found.accepted & loops).sum()),
+        "rejected_loops": int((~found.accepted).sum()),
+        "rejected": _rejected(content, found),
+        "rejected_edges": np.flatnonzero(~found.accepted).tolist(),
+        "noise": found.noise,
+        "error_ratio": found.error_ratio,
+        "iterations": found.iterations,
+        "seconds": found.seconds,
+    }
+
+
+def _print_rejected(content: G2oGraph, found: RobustResult) -> None:
+    rejected = _rejected(content, found)
+    shown = ", ".join(f"{i} - {j}" for i, j in rejected[:_SHOWN]) + (", ..." if len(rejected) > _SHOWN else "")
+    Console().print(
+        f"{len(rejected)} of {int((~found.odometry).sum())} loops rejected{': ' if rejected else ''}{shown}\n"
+        f"largest error left {found.error_ratio:.2f} sigma, {found.seconds:.1f} s in all",
+        highlight=False,
+    )
 
 
 def _print_table(

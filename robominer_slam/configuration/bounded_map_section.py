@@ -42,11 +42,15 @@ class BoundedMapSection(Section):
         0.04, "m", "touches this near cover: lines of touches are 32 mm apart", low=0.005, high=0.5
     )
     max_keyframes: int = parameter(
-        1000, "1", "of the graph: solving all of it takes 25 ms on a desktop, 0.6 s on the board", low=50, high=1_000_000
+        1000, "1", "of the graph: solving all of it takes 25 ms, on the board 0.6 s", low=50, high=1_000_000
     )
     merge_extent: float = parameter(
         1.0, "m", "way that merged keyframes span at most: their drift within is no longer corrected", low=0.0,
         high=100.0,
+    )  # fmt: skip
+    merge_voxel: float = parameter(
+        0.02, "m", "touches of merged keyframes closer than this are one: a cell of the closures' search", low=0.001,
+        high=0.2,
     )  # fmt: skip
     max_points_in_memory: int = parameter(
         300_000, "1", "touches that stay in memory (24 byte each); more are paged to disk", low=10_000,

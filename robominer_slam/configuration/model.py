@@ -150,7 +150,7 @@ class SlamSection(Section):
     """Simultaneous localisation and mapping."""
 
     method: Literal["robust", "thesis", "none"] = parameter(
-        "thesis", "", "robust: this project's; thesis: its pipeline; none: odometry alone"
+        "robust", "", "robust: this project's; thesis: its pipeline; none: odometry alone"
     )
     backend_latency: float = parameter(
         0.5, "s", "a keyframe's result takes effect this long after it, in sensor time, so that replay equals run",

@@ -28,7 +28,7 @@ class RobustEstimationSection(Section):
         0.1, "m", "way over which the array's deviation stays the same (1/e)", low=0.005, high=1.0
     )
     drag_spacing: float = parameter(
-        0.02, "m", "way from one measurement to the next: nearer ones say the same", low=0.0, high=0.5
+        0.03, "m", "way from one measurement to the next: nearer ones say the same", low=0.0, high=0.5
     )
     drag_slide: float = parameter(
         2.2, "rad", "turn of a rod per cross slope at start: 1 / friction and more, less what the fit of slopes misses",
@@ -37,7 +37,11 @@ class RobustEstimationSection(Section):
     drag_sigma_slide: float = parameter(0.8, "rad", "how far a ground's value is from that", low=1e-3, high=10.0)
     drag_slide_length: float = parameter(10.0, "m", "way over which the ground's value changes", low=0.1, high=1e4)
     drag_min_inclination_deg: float = parameter(
-        8.0, "deg", "a rod less inclined has no clear direction: noise of 0.4 deg would turn it by 3", low=2.0, high=45.0
+        8.0,
+        "deg",
+        "a rod less inclined has no clear direction: noise of 0.4 deg would turn it by 3",
+        low=2.0,
+        high=45.0,
     )
     drag_mount_tilt_deg: float = parameter(
         30.0, "deg", "mounts farther from straight down are for walls", low=1.0, high=89.0
@@ -78,16 +82,30 @@ class RobustEstimationSection(Section):
     slip_mode_weight: float = parameter(
         0.5, "1", "share of the screws' slip mode that is taken as error of each velocity", low=0.0, high=10.0
     )
+    fastest: float = parameter(
+        2.0, "m/s", "ten times RM3's speed: screws that say more have a jump in their encoders", low=0.1, high=100.0
+    )
     still_screw_speed: float = parameter(
         0.05, "rad/s", "all screws slower than this: the robot stands, velocity zero", low=0.0, high=10.0
     )
     sigma_still: float = parameter(0.002, "m/s, rad/s", "creep of a robot whose screws stand", low=1e-5, high=0.1)
     sigma_match: float = parameter(
-        0.0005, "m", "what scan matches have in common: a row's whiskers err by 1.2 mm each against the next row's",
+        0.0001, "m", "what scan matches have in common: whiskers' errors of 1.2 mm each, averaged",
         low=0.0, high=0.1,
     )  # fmt: skip
-    sigma_match_yaw_deg: float = parameter(0.12, "deg", "as sigma_match, over the array's half width", low=0.0, high=5.0)
-    match_length: float = parameter(3.0, "m", "way over which that stays the same", low=0.01, high=100.0)
+    sigma_match_yaw_deg: float = parameter(
+        0.07, "deg", "as sigma_match, over the array's half width", low=0.0, high=5.0
+    )
+    match_length: float = parameter(10.0, "m", "way over which that stays the same", low=0.01, high=100.0)
+    tilt_time_constant: float = parameter(
+        5.0, "s", "averages the specific force's noise; a BNO080's gyro drifts by 0.3 deg in it", low=0.5, high=300.0
+    )
+    sigma_tilt_deg: float = parameter(
+        0.3, "deg", "of roll and pitch: the accelerometer's bias of 0.03 m/s2 is 0.2 deg", low=0.01, high=10.0
+    )
+    height_walk: float = parameter(
+        0.01, "m/sqrt(m)", "how the error of z grows where the body follows uneven ground", low=0.0, high=1.0
+    )
     gate: float = parameter(
         16.0, "1", "squared Mahalanobis distance (three axes) beyond which a measurement loses weight: 0.1 % by chance",
         low=3.0, high=1000.0,

@@ -39,7 +39,7 @@ class ScanMatchingSection(Section):
     associations: int = parameter(1, "1", "how often planes are looked up in a match", low=1, high=10)
     least_inliers: float = parameter(0.4, "1", "share of touches that must fit", low=0.0, high=1.0)
     share: float = parameter(
-        0.15, "1", "of the touches' information that counts: they share their whiskers' errors", low=1e-4, high=1.0
+        0.3, "1", "of the touches' information that counts: they share their whiskers' errors", low=1e-4, high=1.0
     )
 
 
@@ -68,19 +68,27 @@ class ClosureSection(Section):
     min_contrast: float = parameter(
         1.5, "1", "the ground's relief over what is left of it: flat ground fits everywhere", low=0.0, high=100.0
     )
-    uniqueness: float = parameter(
-        1.3, "1", "cost of the next best place over that of the best", low=1.0, high=100.0
-    )
+    uniqueness: float = parameter(1.3, "1", "cost of the next best place over that of the best", low=1.0, high=100.0)
     max_moved: float = parameter(
         4.0, "1", "distance from the prediction in sigmas, three axes: 0.1 % by chance", low=1.0, high=100.0
     )
-    max_sigma: float = parameter(0.02, "m", "a match that leaves a direction free is none", low=0.001, high=1.0)
-    max_sigma_yaw_deg: float = parameter(2.0, "deg", "as max_sigma", low=0.1, high=45.0)
+    max_sigma: float = parameter(0.025, "m", "a match that leaves a direction free is none", low=0.001, high=1.0)
+    max_sigma_yaw_deg: float = parameter(2.5, "deg", "as max_sigma", low=0.1, high=45.0)
     inflation: float = parameter(
-        40.0, "1", "touches share errors, and so do patches that follow each other: variance over that of independence", low=1.0, high=1000.0
+        40.0,
+        "1",
+        "touches share errors, and so do patches that follow each other: variance over that of independence",
+        low=1.0,
+        high=1000.0,
     )
-    floor: float = parameter(0.002, "m", "least sigma of a closure: what whiskers have in common", low=0.0, high=0.1)
-    floor_yaw_deg: float = parameter(0.2, "deg", "as floor", low=0.0, high=10.0)
+    floor: float = parameter(
+        0.007,
+        "m",
+        "least sigma of a closure: what whiskers have in common goes through a whole pass",
+        low=0.0,
+        high=0.1,
+    )
+    floor_yaw_deg: float = parameter(1.2, "deg", "as floor", low=0.0, high=10.0)
     agreement: float = parameter(
         16.3, "1", "chi-square of two closures' difference (three axes): 0.1 % by chance", low=1.0, high=1000.0
     )

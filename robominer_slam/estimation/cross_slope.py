@@ -55,4 +55,5 @@ class CrossSlope:
         xx += FLATNESS / NEAR**2
         yy += FLATNESS / NEAR**2
         determinant = xx * yy - xy * xy
-        return np.stack([yy * xz - xy * yz, xx * yz - xy * xz]) / determinant
+        slopes: FloatArray = np.stack([yy * xz - xy * yz, xx * yz - xy * xz]) / determinant
+        return slopes

@@ -69,11 +69,13 @@ class DragInformation:
         information: shape (3, 3); singular along the motion itself, of which the tips say nothing.
         vector: information times the correction of the velocity, shape (3,).
         tips: how many counted.
+        ahead: direction of motion that it was linearised at, unit vector, shape (2,).
     """
 
     information: FloatArray
     vector: FloatArray
     tips: int
+    ahead: FloatArray
 
     def compressed(self) -> tuple[FloatArray, FloatArray]:
         """Rows H (k, 3) and innovations (k,) with unit covariance that say the same; k of 0 to 3."""
@@ -99,6 +101,8 @@ class DragDirection:
         self._least_inclination = math.radians(settings.drag_min_inclination_deg)
         self._sigma2 = math.radians(settings.drag_sigma_deg) ** 2
         self._slopes = CrossSlope(layout, self._floor)
+        #: Horizontal parts of the mounts' axes times the rods' lengths, shape (3 axes, 2, n).
+        self._columns = np.ascontiguousarray(layout.R_base_whisker[:, :2].transpose(2, 1, 0)) * layout.length
         self._frames: deque[tuple[int, Contacts]] = deque(maxlen=WINDOW + 1)
         self._way = 0.0
         self._last_ns: int | None = None
@@ -111,12 +115,10 @@ class DragDirection:
     def reach(self, contacts: Contacts) -> FloatArray:
         """Horizontal vectors from base to tip, shape (2, m), m, in base_link."""
         sine = np.sin(contacts.inclination)
-        direction = np.stack(
-            [sine * np.cos(contacts.azimuth), sine * np.sin(contacts.azimuth), np.cos(contacts.inclination)], axis=1
-        )
-        R = self._layout.R_base_whisker[contacts.index, :2]
-        rod: FloatArray = np.matmul(R, direction[:, :, None])[:, :, 0].T
-        return rod * self._layout.length[contacts.index]
+        x, y, z = sine * np.cos(contacts.azimuth), sine * np.sin(contacts.azimuth), np.cos(contacts.inclination)
+        columns = self._columns[:, :, contacts.index]
+        rod: FloatArray = columns[0] * x + columns[1] * y + columns[2] * z
+        return rod
 
     def measure(
         self, stamp_ns: int, contacts: Contacts, velocity: FloatArray, covariance: FloatArray
@@ -154,18 +156,20 @@ class DragDirection:
         if direction is None or direction @ scaled < SAME_DIRECTION * size:
             direction, self._shown_way = scaled / size, 0.0
         new_way = self._shown_way < settings.drag_length
-        found = self._information(tips, velocity, direction / METRIC * size)
+        at = direction / METRIC * size
+        found = self._information(tips, at)
         shown = self._shown(found, velocity, covariance)
         self._shown_way += way
         direction = direction + way / min(self._shown_way, SHOWN_LENGTH) * (shown - direction)
         self._direction = direction / math.sqrt(direction @ direction)
-        if new_way:
+        speed = math.hypot(at[0], at[1])
+        if new_way or speed < settings.drag_least_speed:
             return None
-        self._learn_slide(found, covariance, min(1.0, way / (2.0 * settings.drag_length)))
         discount = min(1.0, way / (2.0 * settings.drag_length))
+        self._learn_slide(found, covariance, discount)
         shared = np.linalg.inv(np.eye(3) + found.information @ self._common(velocity)) * discount
         information = shared @ found.information
-        return DragInformation(0.5 * (information + information.T), shared @ found.vector, found.tips)
+        return DragInformation(0.5 * (information + information.T), shared @ found.vector, found.tips, at[:2] / speed)
 
     def _trailing(self, contacts: Contacts, old: Contacts, span: float, velocity: FloatArray) -> _Tips | None:
         index = contacts.index
@@ -188,8 +192,8 @@ class DragDirection:
         gradient = self._slopes.gradient(contacts.points, index)
         return _Tips(p[:, ok], turning[:, ok], d[:, ok], gradient[:, ok], swept[:, ok])
 
-    def _information(self, tips: _Tips, velocity: FloatArray, at: FloatArray) -> _Frame:
-        """What the tips say about the velocity's difference from `velocity`, linearised at `at`."""
+    def _information(self, tips: _Tips, at: FloatArray) -> _Frame:
+        """What the tips say about the velocity's difference from its estimate, linearised at `at`."""
         rows, angle, cross, speed, weight = self._linearised(tips, _swept(tips.p, tips.turning, at))
         steady = tips.swept - tips.turning
         innovation = angle * speed - (rows[0] * steady[0] + rows[1] * steady[1])

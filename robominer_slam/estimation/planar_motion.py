@@ -129,6 +129,31 @@ def compose_jacobian(state: FloatArray) -> FloatArray:
     return J
 
 
+def motion_ahead(state: FloatArray, ahead: FloatArray, screws: FloatArray | None) -> FloatArray:
+    """Orthonormal combinations of states that are motion ahead, shape (k, n): the drag's angle must not move them.
+
+    Its derivative by them is zero but for noise in the direction, which repeated updates would take for knowledge of
+    the speed.
+
+    Args:
+        state: shape (n,).
+        ahead: direction of motion in base_link, unit vector, shape (2,).
+        screws: vx, vy of the screws without slip; None where the slow states are biases of vx, vy, wz.
+    """
+    c, s = math.cos(state[YAW]), math.sin(state[YAW])
+    held = np.zeros((3 if screws is None else 4, len(state)))
+    held[0, VX:WZ] = ahead
+    held[1, X:YAW] = c * ahead[0] - s * ahead[1], s * ahead[0] + c * ahead[1]
+    if screws is None:
+        held[2, SLOW : SLOW + 2] = ahead
+        return held
+    by_slip = ahead * screws
+    by_slip = by_slip / max(math.hypot(by_slip[0], by_slip[1]), 1e-9)
+    held[2, SLIP_MEAN.start : SLIP_MEAN.start + 2] = by_slip
+    held[3, SLIP.start : SLIP.start + 2] = by_slip
+    return held
+
+
 class PlanarFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has no types
     """filterpy's filter with our motion, and a gate that never shuts.
 
@@ -166,7 +191,8 @@ class PlanarFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has 
         """
         self._inputs, self._fading = inputs, fading
         F, D = motion_jacobian(self.x, inputs)
-        Q = np.diag(q)
+        Q = np.zeros_like(self.P)
+        Q.flat[:: len(q) + 1] = q
         by_velocity = D @ Q_velocity
         Q[REL, REL] += by_velocity @ D.T
         Q[REL, VELOCITY] = by_velocity
@@ -191,7 +217,10 @@ class PlanarFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has 
         """
         PHT = self.P @ H.T
         S = H @ PHT + R
-        distance = float(innovation @ np.linalg.solve(S, innovation))
+        if len(innovation) == 1:
+            distance = float(innovation[0] ** 2 / S[0, 0])
+        else:
+            distance = float(innovation @ np.linalg.solve(S, innovation))
         if distance > self.gate:
             self.outliers += 1
             R = R * (distance / self.gate)

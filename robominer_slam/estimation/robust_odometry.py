@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.measurement import ImuSample, Measurement, OdometrySample, ScrewAngles, ScrewSpeeds
-from robominer_slam import geometry
 from robominer_slam.configuration.robust_estimation_section import RobustEstimationSection
 from robominer_slam.contacts import Contacts
 from robominer_slam.estimation.drag_direction import DragDirection
-from robominer_slam.estimation.gyro_batch import GyroBatch
+from robominer_slam.estimation.imu_batch import ImuBatch
 from robominer_slam.estimation.keyframe_motion import KeyframeMotion
 from robominer_slam.estimation.odometry_state import OdometryState
 from robominer_slam.estimation.planar_motion import (
@@ -35,15 +34,18 @@ from robominer_slam.estimation.planar_motion import (
     VX,
     VY,
     WZ,
-    X,
-    Y,
     YAW,
     Inputs,
     PlanarFilter,
+    X,
+    Y,
     compose,
     compose_jacobian,
+    motion_ahead,
 )
 from robominer_slam.estimation.screw_speeds import ScrewSpeedAssembly
+from robominer_slam.estimation.spatial_pose import SpatialPose
+from robominer_slam.estimation.turn_comparison import TurnComparison
 
 FloatArray = NDArray[np.float64]
 Source = Literal["fused", "odometry"]
@@ -52,31 +54,12 @@ Source = Literal["fused", "odometry"]
 MAX_INTERVAL_S = 0.5
 #: Slow states with a ready-made odometry: its biases of vx, vy, wz.
 ODOMETRY_BIAS = slice(SLOW, SLOW + 3)
+#: Squared deviations between screws and gyro beyond which the screws are trusted less.
+DISAGREEMENT = 4.0
 #: Less information about a direction, 1/m2 or 1/rad2, is none.
 LEAST_INFORMATION = 1.0
-#: Screws and gyro are compared over so long, s.
-TURN_WINDOW_S = 0.2
 #: Velocity at the start may be anything a robot does.
 SIGMA_START = np.array([0.01, 0.01, 0.01])
-#: More slip than this is a robot that is stuck: the model ends there.
-MAX_SLIP = 0.9
-#: Deviations of what a level body is taken to have: z per keyframe (m), roll and pitch (rad).
-SIGMA_Z, SIGMA_TILT = 0.005, 0.005
-
-
-def screw_turn(state: FloatArray, gyro_angle: float, span: float) -> FloatArray:
-    """Angle by which the screws seem to turn the body while the gyro reads `gyro_angle`, rad, shape (1,)."""
-    grip = max(1.0 - state[SLIP_MEAN.stop - 1] - state[SLIP.stop - 1], 1.0 - MAX_SLIP)
-    return np.array([(gyro_angle - state[GYRO_BIAS] * span) / grip])
-
-
-def screw_turn_jacobian(state: FloatArray, gyro_angle: float, span: float) -> FloatArray:
-    """Derivative of `screw_turn` by the state, shape (1, n)."""
-    grip = max(1.0 - state[SLIP_MEAN.stop - 1] - state[SLIP.stop - 1], 1.0 - MAX_SLIP)
-    H = np.zeros((1, len(state)))
-    H[0, GYRO_BIAS] = -span / grip
-    H[0, SLIP_MEAN.stop - 1] = H[0, SLIP.stop - 1] = (gyro_angle - state[GYRO_BIAS] * span) / grip**2
-    return H
 
 
 class RobustOdometry:
@@ -102,12 +85,14 @@ class RobustOdometry:
         self._screw_matrix = screw_matrix
         fused = source == "fused"
         n = SLOW + (7 if fused else 3) + 3
+        # What scan matches have in common: whiskers' errors, as an offset of each match, in the body's axes.
         self._match = slice(n - 3, n)
         variance = np.zeros(n)
         variance[VELOCITY] = SIGMA_START**2
-        variance[self._match] = self._match_variance = np.square(
+        self._match_variance = np.square(
             [settings.sigma_match, settings.sigma_match, np.deg2rad(settings.sigma_match_yaw_deg)]
         )
+        variance[self._match] = self._match_variance
         x = np.zeros(n)
         if fused:
             variance[GYRO_BIAS] = settings.sigma_gyro_bias**2
@@ -125,27 +110,29 @@ class RobustOdometry:
             self._H_odometry[:, ODOMETRY_BIAS] = np.eye(3)
         self._R_screws = (screw_matrix[:3] @ screw_matrix[:3].T) * settings.sigma_screw_speed**2
         self._speeds = ScrewSpeedAssembly()
-        self._gyro = GyroBatch()
+        self._imu = ImuBatch()
+        self._space = SpatialPose(settings, tilts=fused)
+        self._comparison = TurnComparison(settings.sigma_still, float(self._R_screws[2, 2]))
+        #: What a disagreement with the gyro makes of the screws' variance.
+        self._distrust = 1.0
         self._stamp_ns: int | None = None
         self._screws: ScrewAngles | None = None
         self._odometry_ns: int | None = None
         self._screws_ns: int | None = None
         self._input, self._Q_input = np.zeros(2), np.zeros((2, 2))
-        self._turn_variance = 0.0
-        self._turn_gyro: float | None = None
-        self._turn_screws = self._turn_span = 0.0
-        self._turn_readings, self._turn_still = 0, True
+        self._state: OdometryState | None = None
         self.stale = 0
 
     def add(self, measurement: Measurement) -> None:
         """Take a measurement of the source; others are ignored."""
+        self._state = None
         if self._source == "odometry":
             if isinstance(measurement, OdometrySample):
                 self._add_odometry(measurement)
             return
         match measurement:
             case ImuSample():
-                self._add_imu(measurement)
+                self._imu.add(measurement)
             case ScrewAngles():
                 self._add_angles(measurement)
             case ScrewSpeeds():
@@ -164,34 +151,12 @@ class RobustOdometry:
         found = self._drag.measure(stamp_ns, contacts, ekf.x[VELOCITY], ekf.P[VELOCITY, VELOCITY])
         if found is None:
             return
+        self._state = None
         rows, innovation = found.compressed()
-        H = np.zeros((len(rows), len(self._filter.x)))
+        H = np.zeros((len(rows), len(ekf.x)))
         H[:, VELOCITY] = rows
-        ekf.correct(innovation, H, np.eye(len(rows)), self._along_motion())
-
-    def _along_motion(self) -> FloatArray:
-        """Combinations of states that are motion ahead, shape (k, n): the drag's angle must not move them.
-
-        Its derivative by them is zero but for noise in the direction, which repeated updates would take for
-        knowledge of the speed.
-        """
-        x = self._filter.x
-        vx, vy = x[VX], x[VY]
-        size = max(math.hypot(vx, vy), 1e-9)
-        ahead = np.array([vx, vy]) / size
-        c, s = math.cos(x[YAW]), math.sin(x[YAW])
-        if self._source == "odometry":
-            held = np.zeros((3, len(x)))
-            held[2, SLOW : SLOW + 2] = ahead
-        else:
-            held = np.zeros((4, len(x)))
-            by_slip = ahead * self._input
-            by_slip = by_slip / max(math.hypot(by_slip[0], by_slip[1]), 1e-9)
-            held[2, SLIP_MEAN.start : SLIP_MEAN.start + 2] = by_slip
-            held[3, SLIP.start : SLIP.start + 2] = by_slip
-        held[0, VX:WZ] = ahead
-        held[1, X:YAW] = c * ahead[0] - s * ahead[1], s * ahead[0] + c * ahead[1]
-        return held
+        screws = self._input if self._source == "fused" else None
+        ekf.correct(innovation, H, np.eye(len(rows)), motion_ahead(ekf.x, found.ahead, screws))
 
     def measures_motion(self, measurement: Measurement) -> bool:
         """Screws do if all four are heard of, or the ready-made odometry; a gyro alone does not."""
@@ -204,18 +169,24 @@ class RobustOdometry:
     def state_at(self, stamp_ns: int) -> OdometryState:
         """The state at a time that is not before the last measurement's."""
         self._predict(stamp_ns)
+        if self._state is not None and self._state.stamp_ns == stamp_ns:
+            return self._state
         x, P = self._filter.x, self._filter.P
         pose = compose(x)
         J = compose_jacobian(x)
-        return OdometryState(
+        covariance = J @ P @ J.T
+        self._state = OdometryState(
             stamp_ns,
             float(pose[0]),
             float(pose[1]),
             float(pose[2]),
             x[VELOCITY].copy(),
-            J @ P @ J.T,
+            covariance,
             P[VELOCITY, VELOCITY].copy(),
+            self._space.pose(pose),
+            self._space.covariance(covariance),
         )
+        return self._state
 
     def mark_keyframe(self, stamp_ns: int) -> KeyframeMotion:
         """Motion since the last mark (or the start); the present pose becomes the new reference."""
@@ -227,21 +198,10 @@ class RobustOdometry:
         P_bias = P[b, b].copy()
         by_bias = np.linalg.solve(P_bias + 1e-18 * np.eye(len(P_bias)), P[b, REL]).T
         conditional = P[REL, REL] - by_bias @ P[b, REL]
-        covariance = np.diag([0.0, 0.0, SIGMA_Z**2, SIGMA_TILT**2, SIGMA_TILT**2, 0.0])
-        planar = [0, 1, 5]
-        covariance[np.ix_(planar, planar)] = to_new @ conditional @ to_new.T
-        jacobian = np.zeros((6, len(P_bias)))
-        jacobian[planar] = to_new @ by_bias
-        motion = KeyframeMotion(
-            stamp_ns,
-            geometry.T_from_xyyaw(x[REL]),
-            0.5 * (covariance + covariance.T),
-            jacobian,
-            x[b].copy(),
-            x[b].copy(),
-            P_bias,
-        )
+        T, covariance, jacobian = self._space.motion(x[REL], to_new @ conditional @ to_new.T, to_new @ by_bias)
+        motion = KeyframeMotion(stamp_ns, T, covariance, jacobian, x[b].copy(), x[b].copy(), P_bias)
         self._filter.keyframe()
+        self._state = None
         return motion
 
     def correct_pose(self, stamp_ns: int, offset: FloatArray, information: FloatArray) -> None:
@@ -264,7 +224,9 @@ class RobustOdometry:
         H = np.zeros((len(rows), len(x)))
         H[:, REL] = rows
         H[:, self._match] = rows
-        self._filter.correct(rows @ (to_key @ offset), H, np.diag(1.0 / values[told]))
+        innovation = rows @ (to_key @ offset - x[self._match])
+        self._filter.correct(innovation, H, np.diag(1.0 / values[told]))
+        self._state = None
 
     def relative_covariance(self) -> FloatArray:
         """Covariance of (x, y, yaw) since the last keyframe, in odom, shape (3, 3)."""
@@ -283,10 +245,6 @@ class RobustOdometry:
     def outliers(self) -> int:
         """Measurements beyond the gate."""
         return self._filter.outliers
-
-    def _add_imu(self, sample: ImuSample) -> None:
-        if sample.gyro is not None:
-            self._gyro.add(sample.stamp_ns, sample.gyro)
 
     def _add_odometry(self, sample: OdometrySample) -> None:
         previous, self._odometry_ns = self._odometry_ns, sample.stamp_ns
@@ -313,51 +271,38 @@ class RobustOdometry:
         self._update_screws(reading.stamp_ns, (reading.angle - previous.angle) / interval)
 
     def _update_screws(self, stamp_ns: int, speed: FloatArray) -> None:
-        before = self._screws_ns
-        self._screws_ns = stamp_ns
+        before, self._screws_ns = self._screws_ns, stamp_ns
+        settings, comparison = self._settings, self._comparison
         screws = self._screw_matrix @ speed
-        still = float(np.abs(speed).max()) < self._settings.still_screw_speed
-        self._use_screws(screws, still)
-        self._predict(stamp_ns)
-        if before is None or self._turn_gyro is None:
-            self._start_turn_window()
+        if math.hypot(screws[0], screws[1]) > settings.fastest:
+            self.stale += 1
             return
-        dt = (stamp_ns - before) * 1e-9
-        self._turn_screws += screws[2] * dt
-        self._turn_readings += 1
-        self._turn_still &= still
-        if self._turn_span >= TURN_WINDOW_S:
-            self._compare_turn()
-            self._start_turn_window()
-
-    def _use_screws(self, screws: FloatArray, still: bool) -> None:
-        """Make a reading of all screws (vx, vy, wz, slip mode) the input from now on."""
-        settings = self._settings
+        still = float(np.abs(speed).max()) < settings.still_screw_speed
         self._input = screws[:2]
         if still:
-            self._Q_input = np.eye(2) * settings.sigma_still**2
+            self._Q_input = settings.sigma_still**2 * np.eye(2)
+        else:
+            doubt = (settings.slip_mode_weight * screws[3]) ** 2
+            self._Q_input = self._R_screws[:2, :2] * self._distrust + doubt * np.eye(2)
+        self._predict(stamp_ns)
+        if before is None:
             return
-        doubt = (settings.slip_mode_weight * screws[3]) ** 2
-        self._Q_input = self._R_screws[:2, :2] + np.eye(2) * doubt
+        if not comparison.running:
+            self._turn_by_screws(float(screws[2]), still)
+        elif comparison.add_screws(float(screws[2]) * (stamp_ns - before) * 1e-9, still):
+            distance = self._filter.correct(*comparison.measurement(self._filter.x))
+            self._distrust = max(1.0, distance / DISAGREEMENT)
+            comparison.start(running=True)
 
-    def _compare_turn(self) -> None:
+    def _turn_by_screws(self, rate: float, still: bool) -> None:
+        """Without a gyro, the screws are all that says how fast the body turns."""
         ekf, settings = self._filter, self._settings
-        gyro_angle, span = self._turn_gyro, self._turn_span
-        assert gyro_angle is not None
-        noise = self._turn_variance
-        if self._turn_still:
-            H = np.zeros((1, len(ekf.x)))
-            H[0, GYRO_BIAS] = span
-            R = noise + (settings.sigma_still * span) ** 2
-            ekf.correct(np.array([gyro_angle - ekf.x[GYRO_BIAS] * span]), H, np.array([[R]]))
-            return
-        R = noise + self._R_screws[2, 2] * span**2 / self._turn_readings
-        innovation = self._turn_screws - screw_turn(ekf.x, gyro_angle, span)
-        ekf.correct(innovation, screw_turn_jacobian(ekf.x, gyro_angle, span), np.array([[R]]))
-
-    def _start_turn_window(self) -> None:
-        self._turn_gyro, self._turn_screws, self._turn_span = 0.0, 0.0, 0.0
-        self._turn_variance, self._turn_readings, self._turn_still = 0.0, 0, True
+        share = 1.0 - settings.slip_mean
+        H = np.zeros((1, len(ekf.x)))
+        H[0, WZ] = 1.0
+        slip = (settings.sigma_slip**2 + settings.sigma_slip_mean**2) * rate**2
+        R = settings.sigma_still**2 if still else self._R_screws[2, 2] + slip
+        ekf.correct(np.array([share * rate - ekf.x[WZ]]), H, np.array([[R]]))
 
     def _predict(self, stamp_ns: int) -> None:
         previous = self._stamp_ns
@@ -373,28 +318,38 @@ class RobustOdometry:
         q[X] = q[Y] = settings.position_walk**2 * way
         q[self._match] = self._match_variance * (2.0 * way / settings.match_length)
         walk = settings.acceleration_walk**2 * dt
-        Q_velocity = np.diag([walk, walk, settings.angular_acceleration_walk**2 * dt])
+        Q_velocity = np.zeros((3, 3))
+        Q_velocity[0, 0] = Q_velocity[1, 1] = walk
+        Q_velocity[2, 2] = settings.angular_acceleration_walk**2 * dt
         gyro = screws = None
         kept = 1.0
         if self._source == "fused":
-            samples = max(self._gyro.samples, 1)
-            rate = self._gyro.mean(previous, stamp_ns)
-            if rate is not None:
-                gyro = float(rate[2])
-                Q_velocity[2, 2] = settings.sigma_gyro**2 / samples
-                if self._turn_gyro is not None:
-                    self._turn_gyro += gyro * dt
-                    self._turn_span += dt
-                    self._turn_variance += Q_velocity[2, 2] * dt * dt
-            else:
-                self._turn_gyro = None
+            gyro = self._turn(previous, stamp_ns, dt, Q_velocity)
             if self._screws_ns is not None and stamp_ns - self._screws_ns < MAX_INTERVAL_S * 1e9:
                 screws = self._input
                 Q_velocity[:2, :2] = self._Q_input
             q[GYRO_BIAS] = settings.gyro_bias_walk**2 * dt
-            way += abs(float(x[WZ])) * dt * settings.slip_turn_arm
-            kept = math.exp(-way / settings.slip_length)
+            turned = way + abs(float(x[WZ])) * dt * settings.slip_turn_arm
+            kept = math.exp(-turned / settings.slip_length)
             q[SLIP] = settings.sigma_slip**2 * (1.0 - kept * kept)
         else:
             q[ODOMETRY_BIAS] = settings.odometry_bias_walk**2 * dt
-        ekf.move(Inputs(dt, gyro, screws), Q_velocity, q, kept)
+        ekf.move(Inputs(dt, gyro, screws, self._space.rotation[:2, :2]), Q_velocity, q, kept)
+        self._space.advance(ekf.x[VELOCITY], dt)
+
+    def _turn(self, from_ns: int, until_ns: int, dt: float, Q_velocity: FloatArray) -> float | None:
+        """Take the IMU's samples of an interval; returns the turn rate with its bias, rad/s."""
+        imu, comparison = self._imu, self._comparison
+        samples = max(imu.samples, 1)
+        rate = imu.mean_rate(from_ns, until_ns)
+        gyro = self._space.turn(imu, rate, self._filter.x[VELOCITY], dt)
+        if gyro is None:
+            comparison.start(running=False)
+            return None
+        variance = self._settings.sigma_gyro**2 / samples
+        Q_velocity[2, 2] = variance
+        if not comparison.running:
+            comparison.start(running=True)
+        else:
+            comparison.add_gyro(gyro * dt, variance * dt * dt, dt)
+        return gyro

@@ -87,7 +87,8 @@ class KeyframeMap:
         by_id = {keyframe.id: keyframe for keyframe in self.keyframes}
         for merge in result.merged:
             into, moved = by_id[merge.into], geometry.transform_points(merge.T_into_gone, by_id[merge.gone].points)
-            points = voxel_filter(np.concatenate([into.points, moved]).astype(np.float64), self._voxel)
+            points = np.concatenate([into.points, moved]).astype(np.float64)
+            points = voxel_filter(points, max(merge.voxel, self._voxel))
             by_id[merge.into] = replace(into, points=points.astype(np.float32))
         for key in result.bare:
             by_id[key] = replace(by_id[key], points=np.zeros((0, 3), dtype=np.float32))

@@ -46,7 +46,6 @@ class BoundedMap:
         bounds: with units and reasons there.
         graph: of all keyframes.
         patches: their touches in their level frames.
-        point_voxel: touches of a keyframe closer than this are one, m.
 
     Attributes:
         removed: ids of keyframes that have left the graph since `begin`.
@@ -54,13 +53,10 @@ class BoundedMap:
         bare: ids of keyframes that have lost their touches since `begin`.
     """
 
-    def __init__(
-        self, bounds: BoundedMapSection, graph: KeyframeGraph, patches: PatchMemory, point_voxel: float
-    ) -> None:
+    def __init__(self, bounds: BoundedMapSection, graph: KeyframeGraph, patches: PatchMemory) -> None:
         self._bounds = bounds
         self._graph = graph
         self._patches = patches
-        self._voxel = point_voxel
         self._undecided: deque[int] = deque()
         self._spans: dict[int, float] = {}
         self.removed: list[int] = []
@@ -149,13 +145,13 @@ class BoundedMap:
         before = int(nodes.ids[row - 1])
         shift = np.append(self._graph.relative(before, key), nodes.heights[row] - nodes.heights[row - 1])
         points = np.concatenate([self._patches[before].points, placed(self._patches[key].points, shift)])
-        points = voxel_filter(points, self._voxel)
+        points = voxel_filter(points, self._bounds.merge_voxel)
         self._patches[before] = Patch(points, float(nodes.travelled[row - 1]))
         T = geometry.T_from_xyyaw(shift[:3])
         T[2, 3] = shift[3]
         R_into, R_gone = np.eye(4), np.eye(4)
         R_into[:3, :3], R_gone[:3, :3] = nodes.tilts[row - 1], nodes.tilts[row]
-        self.merged.append(Merge(key, before, R_into.T @ T @ R_gone))
+        self.merged.append(Merge(key, before, R_into.T @ T @ R_gone, self._bounds.merge_voxel))
         step = float(nodes.travelled[row] - nodes.travelled[row - 1])
         self._spans[before] = step + self._spans.get(key, 0.0)
 

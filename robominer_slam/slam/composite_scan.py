@@ -40,6 +40,7 @@ class CompositeScan:
         self._angle = angle
         self._voxel = scan_voxel
         self._scans: list[FloatArray] = []
+        self._floor: list[NDArray[np.bool_]] = []
         self._count = 0
         self._start: FloatArray | None = None
         self._last: FloatArray | None = None
@@ -48,13 +49,16 @@ class CompositeScan:
         self._next_id = 0
         self.dropped_points = 0
 
-    def add(self, stamp_ns: int, T_odom_base: FloatArray, points: FloatArray) -> Keyframe | None:
+    def add(
+        self, stamp_ns: int, T_odom_base: FloatArray, points: FloatArray, floor: NDArray[np.bool_] | None = None
+    ) -> Keyframe | None:
         """Add a scan.
 
         Args:
             stamp_ns: its time.
             T_odom_base: pose in odom, shape (4, 4).
             points: contacts in base_link, shape (m, 3), m; may be empty.
+            floor: which are of whiskers that point down, shape (m,); only without a voxel filter.
 
         Returns:
             The keyframe that this scan completes, or None.
@@ -70,6 +74,8 @@ class CompositeScan:
                 self.dropped_points += len(scan)
             else:
                 self._scans.append(geometry.transform_points(T_odom_base, scan))
+                if floor is not None and self._voxel <= 0.0:
+                    self._floor.append(floor)
                 self._count += len(scan)
         if not self._complete(T_odom_base):
             return None
@@ -79,7 +85,11 @@ class CompositeScan:
         odom_points = np.concatenate(self._scans)
         self._scans, self._count = [], 0
         points_base = geometry.transform_points(geometry.inverse(T_odom_base), odom_points)
-        keyframe = Keyframe(self._next_id, stamp_ns, T_odom_base, points_base, self._travelled)
+        floor_points = np.concatenate(self._floor) if self._floor else None
+        self._floor = []
+        keyframe = Keyframe(
+            self._next_id, stamp_ns, T_odom_base, points_base, self._travelled, floor=floor_points
+        )
         self._next_id += 1
         return keyframe
 

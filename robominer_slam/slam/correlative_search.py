@@ -116,9 +116,11 @@ def search(
         at = xy + centre[:2] - grid.origin
         n, nz, nzz = _transformed(at, z, grid.shape, grid.cell)
         N = _window(irfft2(n * grid.fft_known, s=grid.shape), reach)
-        E = _window(irfft2(nzz * grid.fft_known - 2.0 * nz * grid.fft_height + n * grid.fft_square, s=grid.shape), reach)
+        E = _window(
+            irfft2(nzz * grid.fft_known - 2.0 * nz * grid.fft_height + n * grid.fft_square, s=grid.shape), reach
+        )
         S = _window(irfft2(nz * grid.fft_known - n * grid.fft_height, s=grid.shape), reach)
-        enough = N >= least_overlap * len(points)
+        enough = least_overlap * len(points) <= N
         safe = np.where(enough, N, 1.0)
         costs[k] = np.where(enough, np.maximum(E - S * S / (safe + height_prior), 0.0) / safe, np.inf)
         overlaps[k] = N / len(points)
@@ -157,9 +159,9 @@ def _binned(xy: FloatArray, z: FloatArray, shape: tuple[int, int], cell: float) 
     inside = ((ij >= 0) & (ij < np.array(shape))).all(axis=1)
     place = ij[inside, 0] * shape[1] + ij[inside, 1]
     size = shape[0] * shape[1]
-    total = np.bincount(place, weights=z[inside], minlength=size).reshape(shape)
-    count = np.bincount(place, minlength=size).reshape(shape).astype(np.float64)
-    return total, count
+    total: FloatArray = np.bincount(place, weights=z[inside], minlength=size).astype(np.float64)
+    count: FloatArray = np.bincount(place, minlength=size).astype(np.float64)
+    return total.reshape(shape), count.reshape(shape)
 
 
 def _transformed(xy: FloatArray, z: FloatArray, shape: tuple[int, int], cell: float) -> tuple[FloatArray, ...]:

@@ -24,6 +24,7 @@ class Keyframe:
         T_odom_base: pose of base_link in odom at that time, shape (4, 4).
         points: contact points in base_link at that time, shape (m, 3), m.
         travelled: distance driven by odometry up to here, m.
+        floor: which points are of whiskers that point down, shape (m,); None where all are or nobody asks.
         motion: since the keyframe before, where the dead reckoning tells its noise and biases apart.
     """
 
@@ -33,6 +34,7 @@ class Keyframe:
     points: FloatArray
     travelled: float
     motion: KeyframeMotion | None = None
+    floor: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,11 +63,13 @@ class Merge:
     Attributes:
         gone, into: ids.
         T_into_gone: pose of the one in the other, shape (4, 4).
+        voxel: touches closer than this become one, m.
     """
 
     gone: int
     into: int
     T_into_gone: FloatArray
+    voxel: float
 
 
 @dataclass(frozen=True, slots=True)

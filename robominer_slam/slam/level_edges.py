@@ -58,6 +58,7 @@ class LevelEdges:
     def append(self, edge: LevelEdge) -> None:
         """Add an edge; all have as many biases as the first."""
         nb = edge.reference.size
+        covariance = np.linalg.inv(edge.information)
         if not self._columns:
             self._columns = {
                 "serial": GrowingArray((), np.int64),
@@ -75,10 +76,20 @@ class LevelEdges:
                 "chi2": GrowingArray((), np.float64),
             }
         values: dict[str, object] = {
-            "serial": self._made, "i": edge.i, "j": edge.j, "loop": edge.kind == "loop", "Z": edge.Z,
-            "information": edge.information, "covariance": np.linalg.inv(edge.information), "dz": edge.dz, "dz_information": edge.dz_information,
-            "jacobian": edge.jacobian, "reference": edge.reference, "enabled": True, "chi2": 0.0,
-        }  # fmt: skip
+            "serial": self._made,
+            "i": edge.i,
+            "j": edge.j,
+            "loop": edge.kind == "loop",
+            "Z": edge.Z,
+            "information": edge.information,
+            "covariance": 0.5 * (covariance + covariance.T),
+            "dz": edge.dz,
+            "dz_information": edge.dz_information,
+            "jacobian": edge.jacobian,
+            "reference": edge.reference,
+            "enabled": True,
+            "chi2": 0.0,
+        }
         for name, column in self._columns.items():
             column.extend(np.asarray(values[name])[None])
         self._made += 1

@@ -18,7 +18,11 @@ from robominer_slam import geometry
 from robominer_slam.geometry import FloatArray
 from robominer_slam.slam import pose_graph_residuals as residuals
 from robominer_slam.slam.growing_array import GrowingArray
-from robominer_slam.slam.pose_graph_covariance import joint_covariance
+from robominer_slam.slam.pose_graph_covariance import (
+    joint_covariance,
+    relative_covariances,
+    sampled_relative_covariances,
+)
 from robominer_slam.slam.pose_graph_input import (
     PoseGraphError,
     check_ends,
@@ -136,6 +140,11 @@ class PoseGraph:
         """Omega of all edges, shape (m, d, d)."""
         return np.array(self._information.view)
 
+    @property
+    def fixed_nodes(self) -> tuple[int, ...]:
+        """Nodes that do not move, ascending."""
+        return tuple(sorted(self._fixed))
+
     def add_node(self, pose: ArrayLike) -> int:
         """Add one node with a first guess of its pose, (3,) or (4, 4); returns its number, counted from 0."""
         return int(self.add_nodes(np.asarray(pose, dtype=np.float64)[None])[0])
@@ -195,12 +204,7 @@ class PoseGraph:
         check_ends(a, b, self.node_count, first)
         measurement = checked_poses(self.dim, T_i_j, a.size, "measurement")
         Omega = checked_information(self._d, information, a.size)
-        try:
-            code = kernel_code(kernel)
-        except ValueError as error:
-            raise PoseGraphError(str(error)) from error
-        if not (np.isfinite(kernel_width) and kernel_width > 0.0):
-            raise PoseGraphError(f"kernel width is {kernel_width}; expected a number above 0, in sigmas")
+        code = _checked_kernel(kernel, kernel_width)
         self._i.extend(a)
         self._j.extend(b)
         self._Z_inverse.extend(geometry.se2_inverse(measurement) if self.dim == 2 else geometry.inverse(measurement))
@@ -216,6 +220,17 @@ class PoseGraph:
         """Take edges back (they stay listed but count for nothing), or let them count again."""
         self._enabled.view[edges] = enabled
         self._system = None
+
+    def set_edge_kernel(
+        self, edges: int | Sequence[int] | NDArray[np.int64], kernel: str | None, kernel_width: float = 1.0
+    ) -> None:
+        """Give edges another robust kernel, see `robust_kernels`; None for least squares; the width is in sigmas.
+
+        Raises:
+            PoseGraphError: the kernel is not known, or its width is no number above 0.
+        """
+        self._kernel.view[edges] = _checked_kernel(kernel, kernel_width)
+        self._kernel_width.view[edges] = kernel_width
 
     def fix(self, nodes: Sequence[int]) -> None:
         """Fix these nodes, and no others, where they are (by default node 0).
@@ -307,6 +322,27 @@ class PoseGraph:
         A = np.concatenate([-Ad, np.eye(self._d)], axis=1)
         return np.asarray(A @ self.joint_covariance([i, j]) @ A.T)
 
+    def relative_covariances(self, pairs: ArrayLike, samples: int | None = None, seed: int = 0) -> FloatArray:
+        """Covariances of X_i^-1 X_j for many pairs (i, j), shape (k, 2), as `relative_covariance`, shape (k, d, d).
+
+        Args:
+            pairs: nodes (i, j), shape (k, 2).
+            samples: None for exact covariances, at d solutions a pair; else they come from so many random draws of
+                all poses: a variance is off by sqrt(2 / samples) of itself, and pairs cost next to nothing.
+            seed: of the draws.
+
+        Raises:
+            PoseGraphError: as `optimize`.
+        """
+        enabled, chosen = self._enabled.view, np.asarray(pairs, dtype=np.int64).reshape(-1, 2)
+        edges, kernels, system = self._edge_arrays(enabled), self._kernels(enabled), self._pattern()
+        try:
+            if samples is None:
+                return relative_covariances(edges, kernels, self._poses.view, system, chosen)
+            return sampled_relative_covariances(edges, kernels, self._poses.view, system, chosen, samples, seed)
+        except SingularSystemError as error:
+            raise PoseGraphError(f"the edges do not determine all poses ({error})") from error
+
     # ---------------------------------------------------------------------------------------------- internals
 
     def _edge_arrays(self, which: NDArray[np.bool_]) -> EdgeArrays:
@@ -329,3 +365,13 @@ class PoseGraph:
             check_joined(i, j, fixed)
             self._system = SystemPattern(i, j, fixed, self._d)
         return self._system
+
+
+def _checked_kernel(kernel: str | None, width: float) -> int:
+    try:
+        code = kernel_code(kernel)
+    except ValueError as error:
+        raise PoseGraphError(str(error)) from error
+    if not (np.isfinite(width) and width > 0.0):
+        raise PoseGraphError(f"kernel width is {width}; expected a number above 0, in sigmas")
+    return code

@@ -142,8 +142,11 @@ def linearised(
     pivot: FloatArray,
     system: SystemPattern,
 ) -> tuple[SuperLU, FloatArray, FloatArray, float, FloatArray, FloatArray]:
-    """Factors of H_xx, steps of poses (f, 3) and bias (nb,), promised gain, H_xx^-1 H_xb (3 f, nb), and the bias's
-    information when the poses are eliminated (nb, nb).
+    """Solve the normal equations once.
+
+    Returns:
+        Factors of H_xx, steps of poses (f, 3) and bias (nb,), promised gain, H_xx^-1 H_xb (3 f, nb), and the bias's
+        information when the poses are eliminated (nb, nb).
     """
     edges = problem.edges(bias)
     gradient, blocks = normal_equations(edges, costs, poses, pivot, system, "gtsam")

@@ -34,6 +34,8 @@ FloatArray = NDArray[np.float64]
 
 #: A patch of fewer touches is too small to be told from others.
 LEAST_POINTS = 60
+#: Least variance of an odometry edge in x, y (m2) and heading (rad2): a keyframe's instant is known to 5 ms or so.
+EDGE_FLOOR = np.square([0.001, 0.001, 0.001])
 #: Deviation of the height from one keyframe to the next, m, where the odometry does not say.
 HEIGHT_WALK = 0.002
 HEIGHT_SIGMA = 0.003
@@ -61,7 +63,7 @@ class RobustBackend:
         )
         self._graph = KeyframeGraph()
         self._patches = PatchMemory(bounds.max_points_in_memory, pages)
-        self._map = BoundedMap(bounds, self._graph, self._patches, parameters.point_voxel)
+        self._map = BoundedMap(bounds, self._graph, self._patches)
         self._tracked = TrackedCovariance(self._graph, bounds.refresh)
         self._published = PublishedEdges()
         self._since_full = 0
@@ -75,7 +77,7 @@ class RobustBackend:
 
     def process(self, keyframe: Keyframe) -> BackendResult:
         """Add a keyframe, search for loop closures, optimise."""
-        self._map.begin(keyframe.id, floor_only=True)
+        self._map.begin(keyframe.id, keyframe.floor is None or bool(keyframe.floor.all()))
         self._add_node(keyframe)
         accepted = self._agreed(self._found(keyframe)) if self._is_searched(keyframe.id) else []
         for closure in accepted:
@@ -93,7 +95,9 @@ class RobustBackend:
 
     def _add_node(self, keyframe: Keyframe) -> None:
         level, tilt = levelled(keyframe.T_odom_base)
-        points = voxel_filter(keyframe.points @ tilt.T, self._parameters.point_voxel)
+        # Heights over the plane are the floor's: what touches walls goes into the map only.
+        floor = keyframe.points if keyframe.floor is None else keyframe.points[keyframe.floor]
+        points = voxel_filter(floor @ tilt.T, self._parameters.point_voxel)
         k = keyframe.id
         self._patches[k] = Patch(points, keyframe.travelled)
         graph = self._graph
@@ -111,13 +115,13 @@ class RobustBackend:
         if not nb:
             J = motion.bias_jacobian[PLANAR]
             covariance = covariance + J @ motion.bias_covariance @ J.T
-        information = np.linalg.inv(covariance + np.diag([1e-8, 1e-8, 1e-8]))
+        information = _inverse(covariance + np.diag(EDGE_FLOOR))
         edge = LevelEdge(
             "odometry",
             self._last.id,
             k,
             Z,
-            0.5 * (information + information.T),
+            information,
             dz,
             1.0 / HEIGHT_WALK**2,
             motion.bias_jacobian[PLANAR][:, :nb],
@@ -130,7 +134,9 @@ class RobustBackend:
         # What the loops have taught of the biases stays; what the odometry has learned since is added.
         graph.bias = graph.bias + (posterior - graph.bias_prior) if graph.bias.size == nb else posterior.copy()
         graph.bias_prior = posterior
-        graph.bias_prior_information = np.linalg.inv(motion.bias_covariance[:nb, :nb] + 1e-14 * np.eye(nb))
+        graph.bias_prior_information = np.asarray(
+            np.linalg.inv(motion.bias_covariance[:nb, :nb] + 1e-14 * np.eye(nb)), dtype=np.float64
+        )
         step = geometry.se2_exp(edge.jacobian @ (graph.bias - edge.reference))
         pose = geometry.se2_compose(graph.nodes[self._last.id], geometry.se2_compose(Z, step))
         graph.nodes.append(k, pose, graph.nodes.height(self._last.id) + dz, tilt, keyframe.travelled)
@@ -254,14 +260,14 @@ class RobustBackend:
 
     def _add_loop(self, closure: Closure) -> None:
         nb = self._graph.bias.size
-        information = np.linalg.inv(closure.covariance)
+        information = _inverse(closure.covariance)
         self._graph.edges.append(
             LevelEdge(
                 "loop",
                 closure.i,
                 closure.j,
                 closure.Z,
-                0.5 * (information + information.T),
+                information,
                 closure.dz,
                 1.0 / HEIGHT_SIGMA**2,
                 np.zeros((3, nb)),
@@ -361,3 +367,9 @@ def levelled(T: FloatArray) -> tuple[FloatArray, FloatArray]:
     c, s = np.cos(yaw), np.sin(yaw)
     R_yaw = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     return np.array([T[0, 3], T[1, 3], yaw, T[2, 3]]), R_yaw.T @ T[:3, :3]
+
+
+def _inverse(matrix: FloatArray) -> FloatArray:
+    """Inverse of a covariance or an information matrix, symmetric to the bit."""
+    inverse = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+    return 0.5 * (inverse + inverse.T)

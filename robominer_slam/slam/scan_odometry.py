@@ -81,7 +81,7 @@ class ScanOdometry:
         self._map.update(self.travelled, pose[:2], self._reach)
         if not len(self._map.surface):
             return None
-        prior = np.linalg.inv(covariance + np.eye(4) * 1e-12)
+        prior: FloatArray = np.asarray(np.linalg.inv(covariance + np.eye(4) * 1e-12), dtype=np.float64)
         found = fit(self._map.surface, points, pose, prior, associations=self._parameters.associations)
         if found.overlap * len(points) < LEAST_CONTACTS or found.inliers < self._parameters.least_inliers:
             return None
@@ -94,7 +94,7 @@ class ScanOdometry:
         H = found.curvature
         gradient = found.gradient - H @ offset
         reduced = gradient[:3] - H[:3, Z] * gradient[Z] / max(H[Z, Z], 1e-12)
-        return ScanCorrection(_least(height_left_free(H), -reduced), information, float(offset[Z]))
+        return ScanCorrection(_least(height_left_free(found.information), -reduced), information, float(offset[Z]))
 
     def add(self, pose: FloatArray, points: FloatArray) -> None:
         """Put a frame's contacts (in base_link, levelled) into the map at its corrected pose (x, y, yaw, z)."""
@@ -120,5 +120,4 @@ class ScanOdometry:
 
 def _least(information: FloatArray, right_side: FloatArray) -> FloatArray:
     """Shortest solution of H d = b: directions without information stay where they are."""
-    solution: FloatArray = np.linalg.lstsq(information, right_side, rcond=1e-9)[0]
-    return solution
+    return np.asarray(np.linalg.lstsq(information, right_side, rcond=1e-9)[0], dtype=np.float64)

@@ -29,6 +29,8 @@ REWEIGHTINGS = 3
 KERNEL_WIDTH = 2.5
 #: What noise adds to the information varies about its mean by a quarter or so.
 NOISE_MARGIN = 1.25
+#: Deviation of headings within a surface, rad.
+TURN_SIGMA = 0.03
 #: Residuals under this many sigmas count as fitting.
 INLIER_SIGMAS = 3.0
 
@@ -47,7 +49,7 @@ class SurfaceMatch:
         inliers: share of those whose residual is within three sigmas.
         rms: of the inliers' residuals, m.
         cost: mean squared residual, each at most three sigmas, m2: what places are compared by.
-        relief: standard deviation of the surface's heights under the touches, its common tilt left out, m.
+        heights: of the surface under the touches on it, with their x and y: shape (k, 3), m.
     """
 
     pose: FloatArray
@@ -58,7 +60,16 @@ class SurfaceMatch:
     inliers: float
     rms: float
     cost: float
-    relief: float
+    heights: FloatArray
+
+    @property
+    def relief(self) -> float:
+        """Standard deviation of the surface's heights under the touches, its common tilt left out, m."""
+        if len(self.heights) < 4:
+            return 0.0
+        plane = np.column_stack([np.ones(len(self.heights)), self.heights[:, :2] - self.heights[:, :2].mean(axis=0)])
+        tilt, *_ = np.linalg.lstsq(plane, self.heights[:, 2], rcond=None)
+        return float(np.std(self.heights[:, 2] - plane @ tilt))
 
 
 def placed(points: FloatArray, pose: FloatArray) -> FloatArray:
@@ -103,7 +114,9 @@ def fit(
         known = patches.known
         if int(known.sum()) < 4:
             nothing = np.zeros((4, 4))
-            return SurfaceMatch(pose, nothing, nothing, np.zeros(4), float(known.mean()), 0.0, 0.0, np.inf, 0.0)
+            return SurfaceMatch(
+                pose, nothing, nothing, np.zeros(4), float(known.mean()), 0.0, 0.0, np.inf, np.zeros((0, 3))
+            )
         r = q[known, 2] - patches.height[known]
         J = residual_jacobian(q[known], pose, patches.slope[known])
         inverse_variance = 1.0 / patches.variance[known]
@@ -118,7 +131,8 @@ def fit(
             step = np.linalg.solve(H + regular, -JtW @ r - prior_information @ offset)
         gradient = JtW @ (r + J @ step)
         pose = pose + step
-    noise = slope_noise_information(q[known], pose, patches.slope_noise[known], weight)
+    slope_noise = patches.slope_noise[known] + turned_slope_noise(patches.slope[known])
+    noise = slope_noise_information(q[known], pose, slope_noise, weight)
     return _judged(pose, (_less(H, noise), H), gradient, patches, q, r + J @ step)
 
 
@@ -126,6 +140,15 @@ def height_left_free(H: FloatArray) -> FloatArray:
     """Information about (x, y, yaw), shape (3, 3), of one about (x, y, yaw, z): the Schur complement of z."""
     planar: FloatArray = H[:3, :3] - np.outer(H[:3, Z], H[Z, :3]) / max(float(H[Z, Z]), 1e-12)
     return planar
+
+
+def turned_slope_noise(slope: FloatArray) -> FloatArray:
+    """Covariance (m, 2, 2) of slopes (m, 2) by headings that were a little off when the surface was touched.
+
+    A ridge that was mapped slightly turned has a slope along itself, and would tell a place along it.
+    """
+    across = np.column_stack([-slope[:, 1], slope[:, 0]]) * TURN_SIGMA
+    return across[:, :, None] * across[:, None, :]
 
 
 def slope_noise_information(q: FloatArray, pose: FloatArray, slope_noise: FloatArray, weight: FloatArray) -> FloatArray:
@@ -166,9 +189,5 @@ def _judged(
     fits = np.abs(residual) < limit
     cost = float(np.mean(np.minimum(residual**2, limit**2)))
     rms = float(np.sqrt(np.mean(residual[fits] ** 2))) if fits.any() else 0.0
-    heights = patches.height[known]
-    xy = q[known, :2] - q[known, :2].mean(axis=0)
-    plane = np.column_stack([np.ones(len(xy)), xy])
-    tilt, *_ = np.linalg.lstsq(plane, heights, rcond=None)
-    relief = float(np.std(heights - plane @ tilt))
-    return SurfaceMatch(pose, *H, gradient, float(known.mean()), float(fits.mean()), rms, cost, relief)
+    heights = np.column_stack([q[known, :2], patches.height[known]])
+    return SurfaceMatch(pose, *H, gradient, float(known.mean()), float(fits.mean()), rms, cost, heights)

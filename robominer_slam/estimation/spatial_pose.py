@@ -1,0 +1,116 @@
+"""Height, roll and pitch beside the planar filter: from its (x, y, yaw) to poses and covariances in space."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robominer_slam.configuration.robust_estimation_section import RobustEstimationSection
+from robominer_slam.estimation.imu_batch import ImuBatch
+from robominer_slam.estimation.tilt import Tilt, cross
+
+FloatArray = NDArray[np.float64]
+
+#: Rows of a twist (translation first) that the planar filter knows.
+PLANAR = [0, 1, 5]
+
+
+class SpatialPose:
+    """Keeps what the planar filter lacks; the robot follows the ground, so the body's vertical velocity is zero.
+
+    Args:
+        settings: noise, with units and reasons there.
+        tilts: False for a body without IMU: it is level.
+
+    Attributes:
+        rotation: from base_link to its levelled frame, shape (3, 3).
+        z: in odom, m.
+        way: driven so far, m.
+    """
+
+    def __init__(self, settings: RobustEstimationSection, tilts: bool) -> None:
+        self._settings = settings
+        self._tilt = Tilt(settings.tilt_time_constant) if tilts else None
+        self._velocity = np.zeros(3)
+        self.rotation = np.eye(3)
+        self.z = self.way = 0.0
+        self._key = (self.rotation, self.z, self.way)
+
+    def turn(self, imu: ImuBatch, rate: FloatArray | None, velocity: FloatArray, dt: float) -> float | None:
+        """Go on with the IMU's samples of an interval.
+
+        Args:
+            imu: the samples; its accelerations are taken.
+            rate: mean of the gyro, rad/s, shape (3,); None without one.
+            velocity: vx, vy (m/s), wz (rad/s), shape (3,).
+            dt: length of the interval, s.
+
+        Returns:
+            The turn rate about the vertical as the gyro reads it, rad/s.
+        """
+        acceleration, tilt = imu.mean_acceleration(), self._tilt
+        if tilt is None or (rate is None and acceleration is None):
+            return None
+        now = np.array([velocity[0], velocity[1], 0.0])
+        own = (now - self._velocity) / dt + cross(np.array([0.0, 0.0, velocity[2]]), now)
+        self._velocity = now
+        tilt.move(dt, rate, acceleration, own, imu.orientation_xyzw)
+        self.rotation = tilt.rotation()
+        return None if rate is None else tilt.turn_rate(rate)
+
+    def advance(self, velocity: FloatArray, dt: float) -> None:
+        """Go on by the body velocity (vx, vy, wz)."""
+        self.way += math.hypot(velocity[0], velocity[1]) * dt
+        self.z += float(self.rotation[2, 0] * velocity[0] + self.rotation[2, 1] * velocity[1]) * dt
+
+    def pose(self, planar: FloatArray) -> FloatArray | None:
+        """Pose of base_link in odom, shape (4, 4), at (x, y, yaw); None for a level body."""
+        return None if self._tilt is None else _pose(planar, self.z, self.rotation)
+
+    def covariance(self, planar: FloatArray, way: float | None = None) -> FloatArray:
+        """Covariance (6, 6) of x, y, z, roll, pitch, yaw from that of (x, y, yaw), after a way in m."""
+        settings = self._settings
+        driven = self.way if way is None else way
+        tilt = math.radians(settings.sigma_tilt_deg) ** 2
+        covariance = np.zeros((6, 6))
+        covariance[:2, :2] = planar[:2, :2]
+        covariance[:2, 5], covariance[5, :2], covariance[5, 5] = planar[:2, 2], planar[2, :2], planar[2, 2]
+        climbed = 0.0 if self._tilt is None else tilt * driven * driven
+        covariance[2, 2] = settings.height_walk**2 * (driven + 0.01) + climbed
+        covariance[3, 3] = covariance[4, 4] = tilt
+        return covariance
+
+    def motion(
+        self, planar: FloatArray, covariance: FloatArray, by_bias: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Motion since the keyframe, in space; the present pose becomes the keyframe.
+
+        Args:
+            planar: pose of the levelled base_link in the keyframe's levelled frame (x, y, yaw), shape (3,).
+            covariance: of its error in its own axes, shape (3, 3).
+            by_bias: derivative of that error by the biases, shape (3, nb).
+
+        Returns:
+            Pose of base_link in the keyframe (4, 4), covariance of its twist error (6, 6), derivative (6, nb).
+        """
+        rotation, z, way = self._key
+        T = _pose(planar, self.z - z, self.rotation)
+        T[:3] = rotation.T @ T[:3]
+        jacobian = np.zeros((6, by_bias.shape[1]))
+        jacobian[PLANAR] = by_bias
+        # From the levelled frame to base_link.
+        to_base = np.kron(np.eye(2), self.rotation.T)
+        spatial = to_base @ self.covariance(covariance, self.way - way) @ to_base.T
+        self._key = (self.rotation, self.z, self.way)
+        return T, 0.5 * (spatial + spatial.T), to_base @ jacobian
+
+
+def _pose(planar: FloatArray, z: float, tilt: FloatArray) -> FloatArray:
+    c, s = math.cos(planar[2]), math.sin(planar[2])
+    T = np.eye(4)
+    T[:2, :3] = np.array([[c, -s], [s, c]]) @ tilt[:2]
+    T[2, :3] = tilt[2]
+    T[:3, 3] = planar[0], planar[1], z
+    return T
