@@ -133,12 +133,14 @@ class MapStore:
     """The thread `store`. Use as a context manager.
 
     Attributes:
+        folder: where the database lies.
         written: keyframes on the disk.
         fault: why nothing is being written now; empty if all is well.
         dropped: keyframes that could not be written because the disk has been failing for long.
     """
 
     def __init__(self, path: Path, sync_s: float, robot: str, name: str) -> None:
+        self.folder = path.parent
         self._connection = open_database(path)
         self._lock = threading.Lock()
         self._sync_s = sync_s

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,11 +13,13 @@ import pytest
 from benchmarks.long_drive import drive, run
 from robominer_slam import geometry
 from robominer_slam.configuration.bounded_map_section import BoundedMapSection
+from robominer_slam.configuration.overrides import overridden
 from robominer_slam.configuration.robust_slam_section import RobustSlamSection
 from robominer_slam.graph_json import graph_json
 from robominer_slam.mapping.keyframe_map import KeyframeMap
 from robominer_slam.patch_pages import SqlitePages
 from robominer_slam.publishing.map_stream import MapStreamDecoder, MapStreamEncoder
+from robominer_slam.replay import prepare, replay
 from robominer_slam.slam.closure_search import Patch
 from robominer_slam.slam.covered_ground import covered_share
 from robominer_slam.slam.graph_marginals import TrackedCovariance
@@ -25,6 +29,7 @@ from robominer_slam.slam.level_edges import LevelEdge
 from robominer_slam.slam.patch_memory import PatchMemory
 from robominer_slam.slam.robust import RobustBackend
 
+RECORDING = Path(__file__).parent / "recordings" / "scenario-1.mcap"
 STEP = np.array([0.25, 0.0, 0.1])
 
 
@@ -254,6 +259,8 @@ def test_a_capped_graph_stays_within_its_cap_and_as_accurate():
     assert free[-1].nodes == 220
     assert np.mean(capped[-1].errors_m) <= np.mean(free[-1].errors_m) + 0.01
     assert np.mean(capped[-1].errors_m) < 0.06
+    assert np.median(capped[-1].backend_ms) <= 3.0 * np.median(capped[0].backend_ms) + 10.0
+    assert capped[-1].points < 0.8 * free[-1].points
 
 
 def test_removed_keyframes_vanish_from_map_graph_and_stream():
@@ -287,6 +294,19 @@ def test_removed_keyframes_vanish_from_map_graph_and_stream():
         assert len(decoder.state.keyframes[keyframe.id].points) <= len(keyframe.points)
         assert bool(len(keyframe.points)) == bool(len(decoder.state.keyframes[keyframe.id].points))
         assert bool(len(keyframe.points)) == (keyframe.id not in bare)
+
+
+def test_a_short_drive_is_as_accurate_with_a_tiny_cap():
+    """On a real recording's keyframes: the end of the drive lies where it lies without bounds, to 4 cm."""
+    inputs = prepare(RECORDING, None)
+    ends = []
+    for bounds in ({}, {"max_keyframes": 50, "small_map": 20, "local_window": 20, "max_points_in_memory": 10_000}):
+        keys = {"slam.method": "robust", "estimation.source": "fused"}
+        keys |= {f"slam.robust.bounds.{name}": value for name, value in bounds.items()}
+        result = replay(replace(inputs, configuration=overridden(inputs.configuration, keys, "test")), lambda _: None)
+        ends.append(result.keyframe_map.poses[-1])
+        assert len(result.keyframe_map.keyframes) <= bounds.get("max_keyframes", 1000)
+    assert np.hypot(*(ends[0] - ends[1])[:2, 3]) < 0.04
 
 
 def test_small_maps_are_solved_whole_and_keep_everything():

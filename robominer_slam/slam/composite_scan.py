@@ -87,9 +87,7 @@ class CompositeScan:
         points_base = geometry.transform_points(geometry.inverse(T_odom_base), odom_points)
         floor_points = np.concatenate(self._floor) if self._floor else None
         self._floor = []
-        keyframe = Keyframe(
-            self._next_id, stamp_ns, T_odom_base, points_base, self._travelled, floor=floor_points
-        )
+        keyframe = Keyframe(self._next_id, stamp_ns, T_odom_base, points_base, self._travelled, floor=floor_points)
         self._next_id += 1
         return keyframe
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -88,6 +88,7 @@ class BackendResult:
         removed: ids of keyframes that have left the graph with all their edges.
         merged: which of these hand their touches to a neighbour, in order.
         bare: ids of keyframes that keep no touches: the map has their ground from others.
+        counts: what the back-end has counted so far, by name.
     """
 
     keyframe: Keyframe
@@ -101,6 +102,7 @@ class BackendResult:
     removed: Sequence[int] = ()
     merged: Sequence[Merge] = ()
     bare: Sequence[int] = ()
+    counts: Mapping[str, int] = field(default_factory=dict)
 
 
 class Backend(Protocol):

@@ -358,6 +358,11 @@ class RobustBackend:
             removed=tuple(self._map.removed),
             merged=tuple(self._map.merged),
             bare=tuple(self._map.bare),
+            counts={
+                **{f"closures.{name}": count for name, count in self.closures.counts.items()},
+                "points.in_memory": self._patches.points_in_memory,
+                "points.fetched": self._patches.fetched,
+            },
         )
 
 
