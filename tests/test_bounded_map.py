@@ -26,6 +26,7 @@ from robominer_slam.slam.graph_marginals import TrackedCovariance
 from robominer_slam.slam.keyframe_graph import KeyframeGraph
 from robominer_slam.slam.keyframe_removal import composed, mergeable, remove_keyframes
 from robominer_slam.slam.level_edges import LevelEdge
+from robominer_slam.slam.loop_transfer import move_loops
 from robominer_slam.slam.patch_memory import PatchMemory
 from robominer_slam.slam.robust import RobustBackend
 
@@ -120,6 +121,36 @@ def test_a_keyframe_without_closures_leaves_without_a_trace():
     graph.optimise()
     np.testing.assert_allclose(graph.nodes[159], pose, atol=2e-5)
     np.testing.assert_allclose(graph.covariance([159]), covariance, rtol=0.01, atol=1e-9)
+
+
+def test_the_map_keeps_the_shape_that_dropped_closures_gave_it():
+    graph = circling(160, off=0.003)
+    keys = [k for k in set(graph.edges.j[graph.edges.loop].tolist()) if k > 100]
+    before = {k: graph.relative(k - 1, k + 1) for k in keys}
+    bridges = remove_keyframes(graph, keys)
+    assert sorted(bridge.i + 1 for bridge in bridges) == sorted(keys)
+    for bridge in bridges:
+        np.testing.assert_allclose(bridge.Z, before[bridge.i + 1], atol=1e-12)
+
+
+def test_moved_closures_say_no_more_than_they_did():
+    """And nearly as much: the odometry edge that they move along is short."""
+    graph = circling(160, off=0.002)
+    stay = [30, 61, 103, 159]
+    before = [graph.covariance([k]) for k in stay]
+    poses = [graph.nodes[k] for k in stay]
+    keys = [*range(68, 150, 8), 5]
+    for key in keys:
+        move_loops(graph, key, key - 1)
+    assert (graph.edges.loop & np.isin(graph.edges.j, [k - 1 for k in keys])).sum() == len(keys) - 1
+    assert not (graph.edges.loop & np.isin(graph.edges.j, keys)).any()
+    remove_keyframes(graph, keys)
+    graph.optimise()
+    for k, old, pose in zip(stay, before, poses, strict=True):
+        new = graph.covariance([k])
+        assert np.linalg.eigvalsh(new - old)[0] >= -1e-3 * np.trace(old)
+        assert np.trace(new) < 1.5 * np.trace(old)
+        np.testing.assert_allclose(graph.nodes[k], pose, atol=0.004)
 
 
 def test_the_first_and_the_last_keyframe_cannot_leave():

@@ -26,6 +26,7 @@ from robominer_slam.slam.keyframe_removal import (
     mergeable,
     remove_keyframes,
 )
+from robominer_slam.slam.loop_transfer import move_loops
 from robominer_slam.slam.patch_memory import PatchMemory
 from robominer_slam.slam.surface_registration import placed
 
@@ -144,6 +145,7 @@ class BoundedMap:
         row = nodes.row(key)
         before = int(nodes.ids[row - 1])
         shift = np.append(self._graph.relative(before, key), nodes.heights[row] - nodes.heights[row - 1])
+        move_loops(self._graph, key, before)
         points = np.concatenate([self._patches[before].points, placed(self._patches[key].points, shift)])
         points = voxel_filter(points, self._bounds.merge_voxel)
         self._patches[before] = Patch(points, float(nodes.travelled[row - 1]))

@@ -5,7 +5,8 @@ The odometry edges on both sides of a keyframe become one: with Z_1, Z_2 taken a
     Z = Z_1 Z_2,   Sigma = Ad Sigma_1 Ad' + Sigma_2,   B = Ad B_1 + B_2,   Ad = Ad(Z_2^-1),
 
 which is exactly what marginalising a keyframe without other edges leaves. Its loop edges are dropped: information
-is lost, and none is counted twice.
+is lost, and none is counted twice. Where loop edges go, the bridge is laid where the keyframes lie now (Z is their
+present relative pose): what the loops knew is no longer counted, but the map keeps the shape that they gave it.
 
 Sources: Forster et al., "On-manifold preintegration" (T-RO 2017), for composed edges; Kretzschmar and Stachniss,
 "Information-theoretic compression of pose graphs" (IJRR 2012), for which keyframes to let go: those that tell the map
@@ -15,6 +16,7 @@ least, here those whose ground it had before.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +67,13 @@ def remove_keyframes(graph: KeyframeGraph, keys: list[int]) -> list[LevelEdge]:
             bridges.append(edge)
     if any(bridge.i in removed or bridge.j in removed for bridge in bridges):
         raise ValueError("the first and the last keyframe of a graph cannot be taken out of it")
+    tied = set(edges.i[gone & edges.loop].tolist()) | set(edges.j[gone & edges.loop].tolist())
+    ids = graph.nodes.ids
+    for place, bridge in enumerate(bridges):
+        between = ids[(ids > bridge.i) & (ids < bridge.j)].tolist()
+        if tied & set(between):
+            dz = graph.nodes.height(bridge.j) - graph.nodes.height(bridge.i)
+            bridges[place] = replace(bridge, Z=graph.relative(bridge.i, bridge.j), dz=dz)
     edges.keep(~gone)
     for bridge in bridges:
         edges.append(bridge)

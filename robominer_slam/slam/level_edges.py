@@ -106,6 +106,22 @@ class LevelEdges:
         self.enabled[which] = on
         self.version += 1
 
+    def set_covariance(self, row: int, covariance: FloatArray) -> None:
+        """Give an edge another covariance, shape (3, 3)."""
+        information = np.linalg.inv(covariance)
+        self.covariance[row] = 0.5 * (covariance + covariance.T)
+        self.information[row] = 0.5 * (information + information.T)
+        self.version += 1
+
+    def renew(self, rows: IndexArray) -> None:
+        """Say that edges were changed into others: they go to the end with new numbers."""
+        changed = [self.edge(int(row)) for row in rows]
+        kept = np.ones(len(self), dtype=np.bool_)
+        kept[rows] = False
+        self.keep(kept)
+        for edge in changed:
+            self.append(edge)
+
     def edge(self, row: int) -> LevelEdge:
         """One edge."""
         return LevelEdge(
