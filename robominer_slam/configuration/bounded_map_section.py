@@ -44,6 +44,10 @@ class BoundedMapSection(Section):
     max_keyframes: int = parameter(
         1000, "1", "of the graph: solving all of it takes 25 ms, on the board 0.6 s", low=50, high=1_000_000
     )
+    tie_spacing: int = parameter(
+        4, "1", "of so many keyframes without touches one stays as long as others can go: its closures hold the map",
+        low=2, high=1000,
+    )  # fmt: skip
     merge_extent: float = parameter(
         1.0, "m", "way that merged keyframes span at most: their drift within is no longer corrected", low=0.0,
         high=100.0,

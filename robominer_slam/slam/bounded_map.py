@@ -106,7 +106,7 @@ class BoundedMap:
         target = bounds.max_keyframes - min(BATCH, bounds.max_keyframes // 10)
         window = min(bounds.local_window, bounds.max_keyframes // 2)
         robot = graph.nodes.poses[-1, :2].copy()
-        self._remove(interior_of_covered(graph, window)[: len(graph.nodes) - target])
+        self._remove(interior_of_covered(graph, window, bounds.tie_spacing)[: len(graph.nodes) - target])
         while len(graph.nodes) > target:
             merged = mergeable(graph, self._spans, bounds.merge_extent, window, robot)[: len(graph.nodes) - target]
             if not merged:

@@ -82,19 +82,22 @@ def remove_keyframes(graph: KeyframeGraph, keys: list[int]) -> list[LevelEdge]:
     return bridges
 
 
-def interior_of_covered(graph: KeyframeGraph, window: int) -> list[int]:
+def interior_of_covered(graph: KeyframeGraph, window: int, tie_spacing: int) -> list[int]:
     """Keyframes that may go first, oldest first: without touches in the map, between two such.
 
-    Their neighbours at the ends of covered stretches stay: their closures tie what is new to what was known.
+    Those at the ends of covered stretches stay, and one in `tie_spacing` within: their closures tie together what was
+    mapped at different times.
 
     Args:
         graph: the graph.
         window: keyframes at the end that stay.
+        tie_spacing: by ids.
     """
     bare = ~graph.nodes.mapped
     interior = bare.copy()
     interior[1:] &= bare[:-1]
     interior[:-1] &= bare[1:]
+    interior &= graph.nodes.ids % tie_spacing != 0
     return _removable(graph, interior, window)
 
 
