@@ -157,3 +157,28 @@ def test_nodes_before_others_keep_the_order_of_ids():
     assert graph.nodes.version > version
     with pytest.raises(ValueError, match="growing ids"):
         graph.nodes.put_before(before)
+
+
+def test_a_robot_carried_away_in_a_bounded_map_finds_back_and_map_and_store_agree(tmp_path, rounds):
+    """Lifted after 150 keyframes, put down 2 m on: what was held back in doubt enters where it belongs."""
+    keyframes, truth = rounds
+    path = tmp_path / "map.db"
+    lifted, on = 150, 8
+    step = geometry.inverse(keyframes[lifted - 1].T_odom_base) @ keyframes[lifted].T_odom_base
+    origin = keyframes[lifted - 1].T_odom_base @ step @ geometry.inverse(keyframes[lifted + on].T_odom_base)
+    after = [
+        replace(k, id=k.id - on, T_odom_base=origin @ k.T_odom_base, travelled=k.travelled - 0.25 * on, breaks=1)
+        for k in keyframes[lifted + on : 300]
+    ]
+    whole, results = session([*keyframes[:lifted], *after], path)
+    held = [n for n, result in enumerate(results) if not result.new_keyframes]
+    assert held
+    assert held[0] == lifted
+    assert results[-1].localised
+    assert len(whole.keyframes) <= CAP
+    assert_stored(path, whole)
+    entered = [k.id for result in results for k in result.new_keyframes]
+    assert entered == list(range(len(results)))
+    last = results[-1]
+    placed = (last.T_map_odom @ last.keyframe.T_odom_base)[:2, 3]
+    assert np.hypot(*(placed - truth[299, :2])) < 0.1
