@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -20,6 +22,7 @@ from robominer_slam.estimation.robust_odometry import RobustOdometry
 from robominer_slam.estimation.screw_kinematics import forward_matrix
 from robominer_slam.flow_bend import FlowBend
 from robominer_slam.layout import WhiskerLayout
+from robominer_slam.patch_pages import SqlitePages
 from robominer_slam.pipeline import Pipeline
 from robominer_slam.rest_tracking import RestTracker
 from robominer_slam.slam.backend_runner import BackendRunner, SynchronousRunner, ThreadedRunner
@@ -43,9 +46,17 @@ def build_pipeline(
     model: PolynomialModel,
     execution: Execution,
     known: SavedMap | None = None,
+    page_folder: Path | None = None,
 ) -> Pipeline:
-    """Assemble the pipeline; `threaded` for the daemon, `synchronous` for replay; in a known map, if there is one."""
-    composite, runner = build_slam(configuration, execution, known)
+    """Assemble the pipeline; `threaded` for the daemon, `synchronous` for replay; in a known map, if there is one.
+
+    Args:
+        configuration, layout, model: what it is made of.
+        execution: of the back-end.
+        known: the map to start in; None for a new one.
+        page_folder: where a map that outgrows the memory is paged to; None for the system's temporary files.
+    """
+    composite, runner = build_slam(configuration, execution, known, page_folder)
     contact = configuration.contact
     pipeline = Pipeline(
         dead_reckoning=_dead_reckoning(configuration, layout),
@@ -74,7 +85,10 @@ def build_pipeline(
 
 
 def build_slam(
-    configuration: Configuration, execution: Execution, known: SavedMap | None = None
+    configuration: Configuration,
+    execution: Execution,
+    known: SavedMap | None = None,
+    page_folder: Path | None = None,
 ) -> tuple[CompositeScan | None, BackendRunner | None]:
     """The method's front-end and back-end, fresh or in a known map; nothing for odometry alone."""
     slam = configuration.slam
@@ -89,7 +103,8 @@ def build_slam(
         case "robust":
             first = known.next_id if known is not None else 0
             composite = CompositeScan(slam.robust.keyframe_distance, slam.robust.keyframe_angle, 0.0, first)
-            backend = LocalisedBackend(slam.robust, known, frozen=known is not None and slam.start == "localize")
+            frozen = known is not None and slam.start == "localize"
+            backend = LocalisedBackend(slam.robust, known, frozen, partial(SqlitePages, page_folder))
     latency_ns = round(slam.backend_latency * 1e9)
     if execution == "threaded":
         return composite, ThreadedRunner(backend, latency_ns, slam.backend_queue)

@@ -62,7 +62,7 @@ class Daemon:
         self._lock = threading.Lock()
         self._clock = WallClock()
         self._carries = {one.name: one.carries for one in device_settings(configuration)}
-        self._pipeline = build_pipeline(configuration, array.layout, array.model, "threaded", known)
+        self._pipeline = build_pipeline(configuration, array.layout, array.model, "threaded", known, store.folder)
         self._map = KeyframeMap(configuration.map.point_voxel)
         section = configuration.map
         self._publisher = Publisher(bus, self._clock, array.layout)
@@ -166,7 +166,7 @@ class Daemon:
 
     def _new_map(self) -> None:
         self._store.new_map(self._configuration.robot.id, "")
-        self._pipeline.start_new_map(*build_slam(self._configuration, "threaded"))
+        self._pipeline.start_new_map(*build_slam(self._configuration, "threaded", page_folder=self._store.folder))
         self._map_service.new_map()
 
     def _declare_queries(self) -> None:

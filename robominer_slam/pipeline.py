@@ -109,6 +109,11 @@ class Pipeline:
         """Process what still waits for its turn, at the end of the measurements."""
         return self._process(self.reorder.flush())
 
+    @property
+    def backend_counts(self) -> Mapping[str, int]:
+        """What the back-end had counted at its last result, by name."""
+        return {} if self._last_result is None else self._last_result.counts
+
     def rezero(self) -> bool:
         """Take the last frame as the array's rest position; False if there was none."""
         if self._last_frame is None:

@@ -56,6 +56,7 @@ def slam_diagnostic(
         values["backend.late"] = str(pipeline.runner.late)
         values["backend.max_late_s"] = f"{pipeline.runner.max_late_ns * 1e-9:.3f}"
         values["backend.busy_s"] = f"{pipeline.runner.busy_s:.3f}"
+        values |= {f"backend.{name}": str(count) for name, count in sorted(pipeline.backend_counts.items())}
     if frame is None:
         return Diagnostic("localization", Level.WARN, "no whisker frame yet", values)
     values["sigma_xy_m"] = f"{np.sqrt(np.trace(frame.covariance[:2, :2])):.3f}"

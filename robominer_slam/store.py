@@ -1,5 +1,7 @@
 """Keyframes kept in SQLite: one writer thread, batched commits, WAL with full sync.
 
+What the back-end takes out of the graph is taken out here too, with its edges; the edges that bridge it are added.
+
 Schema and tools are sqlite-utils' (imported only when a database is made); the rows of a drive are written with
 plain SQL, since sqlite-utils costs 5 ms a row. A batch is on the disk at most `sync_s` after its oldest keyframe.
 Poses that the back-end has moved since are written every few seconds, the weights of edges with them: a process
@@ -15,14 +17,14 @@ import threading
 import time
 import zlib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robominer_slam import geometry
-from robominer_slam.slam.keyframe import BackendResult, GraphEdge
+from robominer_slam.slam.keyframe import BackendResult, GraphEdge, Keyframe, Merge
 
 log = logging.getLogger(__name__)
 
@@ -115,18 +117,39 @@ def open_database(path: Path) -> sqlite3.Connection:
 
 
 @dataclass(frozen=True, slots=True)
-class Item:
-    """What one result adds to the map: its keyframes are written with these edges; stamps get the offset, ns."""
+class _Change:
+    """What a result changes in the store; without the poses of the whole map, since many may wait for the disk.
 
-    result: BackendResult
-    edges: tuple[GraphEdge, ...]
+    Attributes:
+        keyframes: new ones, with their poses in map.
+        edges: new ones.
+        removed, merged, bare: as in `BackendResult`.
+        clock_offset_ns: added to stamps.
+    """
+
+    keyframes: Sequence[tuple[Keyframe, FloatArray]]
+    edges: Sequence[GraphEdge]
+    removed: Sequence[int]
+    merged: Sequence[Merge]
+    bare: Sequence[int]
     clock_offset_ns: int
+
+    @classmethod
+    def of(cls, result: BackendResult, edges: Sequence[GraphEdge], clock_offset_ns: int) -> _Change:
+        place = {k: n for n, k in enumerate(result.keyframe_ids)} if result.new_keyframes else {}
+        keyframes = [(k, result.poses[place[k.id]].copy()) for k in result.new_keyframes]
+        return cls(keyframes, edges, result.removed, result.merged, result.bare, clock_offset_ns)
+
+    def without_keyframes(self) -> _Change:
+        """What is left of it when its keyframes are lost."""
+        return replace(self, keyframes=())
 
 
 class MapStore:
     """The thread `store`. Use as a context manager.
 
     Attributes:
+        folder: where the database lies.
         written: keyframes on the disk.
         fault: why nothing is being written now; empty if all is well.
         dropped: keyframes that could not be written because the disk has been failing for long.
@@ -137,12 +160,15 @@ class MapStore:
         self, path: Path, sync_s: float, robot: str, name: str, map_id: int | None = None, frozen: bool = False
     ) -> None:
         """Open the database; keyframes go into a new map, or are added to that of `map_id`, which may be frozen."""
+        self.folder = path.parent
         self._connection = open_database(path)
         self._lock = threading.Lock()
         self._sync_s = sync_s
-        self._queue: queue.Queue[Item | None] = queue.Queue(QUEUE_LENGTH)
+        self._queue: queue.Queue[list[_Change] | None] = queue.Queue(QUEUE_LENGTH)
+        self._late: list[_Change] = []
         self.map_id = self._start_map(robot, name) if map_id is None else map_id
         self._edges_seen = self._stored_edges() if map_id is not None else set()
+        self._latest: BackendResult | None = None
         self._moved: BackendResult | None = None
         self._poses_written: dict[int, FloatArray] = {}
         self._weights_written: dict[EdgeKey, float] = {}
@@ -151,7 +177,7 @@ class MapStore:
         self.written = 0
         self.dropped = 0
         self.fault = ""
-        self._failed: list[Item] = []
+        self._failed: list[_Change] = []
         self._thread = threading.Thread(target=self._run, name="store", daemon=True)
 
     def __enter__(self) -> MapStore:
@@ -164,16 +190,24 @@ class MapStore:
         self._connection.close()
 
     def add(self, result: BackendResult, clock_offset_ns: int) -> None:
-        """Keep a result's new keyframes and edges, and in time its poses; never waits for the disk."""
+        """Keep a result's new keyframes and edges, in time its poses, and drop what left the graph; never waits."""
         if self.frozen:
             return
-        edges = tuple(e for e in result.edges if (e.kind, e.i, e.j) not in self._edges_seen)
+        edges = result.added
+        if edges is None:
+            edges = [e for e in result.edges if (e.kind, e.i, e.j) not in self._edges_seen]
+        self._edges_seen.update((e.kind, e.i, e.j) for e in edges)
+        if result.removed:
+            gone = set(result.removed)
+            self._edges_seen = {key for key in self._edges_seen if key[1] not in gone and key[2] not in gone}
+        change = _Change.of(result, edges, clock_offset_ns)
+        self._latest = result
         try:
-            self._queue.put_nowait(Item(result, edges, clock_offset_ns))
+            self._queue.put_nowait([*self._late, change])
+            self._late = []
         except queue.Full:
             self.dropped += len(result.new_keyframes)
-            return
-        self._edges_seen.update((e.kind, e.i, e.j) for e in edges)
+            self._late.append(change.without_keyframes())
 
     def save_poses(self, poses: FloatArray, ids: Iterable[int] | None = None, edges: Sequence[GraphEdge] = ()) -> None:
         """Write what the back-end has corrected since the keyframes were stored.
@@ -191,7 +225,10 @@ class MapStore:
     def _update(self, poses: FloatArray, ids: Iterable[int], edges: Sequence[GraphEdge]) -> None:
         places = dict(zip(ids, poses, strict=True))
         moved = {k: T for k, T in places.items() if self._differs(k, T)}
-        weights: dict[EdgeKey, float] = {(e.kind, e.i, e.j): e.weight for e in edges}
+        weights: dict[EdgeKey, float] = {}
+        for e in edges:
+            # Merged keyframes may leave two closures of one name: none counts if one was taken back.
+            weights[e.kind, e.i, e.j] = min(e.weight, weights.get((e.kind, e.i, e.j), 1.0))
         weights = {key: w for key, w in weights.items() if self._weights_written.get(key) != w}
         pose_rows = [(_pack_pose(T), self.map_id, k) for k, T in moved.items()]
         weight_rows = [(w, self.map_id, *key) for key, w in weights.items()]
@@ -221,7 +258,8 @@ class MapStore:
             self.map_id = self._start_map(robot, name)
         self.frozen = False
         self._edges_seen = set()
-        self._moved = None
+        self._late = []
+        self._latest = self._moved = None
         self._poses_written, self._weights_written = {}, {}
 
     @property
@@ -252,7 +290,7 @@ class MapStore:
         stopping = False
         while not stopping:
             item = self._queue.get()
-            batch = [] if item is None else [item]
+            batch = [] if item is None else list(item)
             stopping = item is None
             taken = 1
             # Half the time that a keyframe may wait is for collecting, the rest for a slow card.
@@ -266,10 +304,10 @@ class MapStore:
                 if item is None:
                     stopping = True
                 else:
-                    batch.append(item)
+                    batch += item
             self._write(self._failed + batch)
             if batch:
-                self._moved = batch[-1].result
+                self._moved = self._latest
             self._write_moved(stopping)
             for _ in range(taken):
                 self._queue.task_done()
@@ -289,36 +327,14 @@ class MapStore:
             log.warning("corrected poses cannot be stored now: %s", error)
             self._moved = result
 
-    def _write(self, batch: list[Item]) -> None:
+    def _write(self, batch: list[_Change]) -> None:
         if not batch:
-            return
-        keyframes, edges = [], []
-        written: dict[int, FloatArray] = {}
-        count = 0
-        for item in batch:
-            place = {k: n for n, k in enumerate(item.result.keyframe_ids)}
-            for keyframe in item.result.new_keyframes:
-                T_map = item.result.poses[place[keyframe.id]]
-                written[keyframe.id] = T_map
-                keyframes.append(
-                    (
-                        self.map_id,
-                        keyframe.id,
-                        keyframe.stamp_ns + item.clock_offset_ns,
-                        _pack_pose(keyframe.T_odom_base),
-                        _pack_pose(T_map),
-                        pack_points(keyframe.points),
-                    )
-                )
-                count += 1
-            edges += [_edge_row(self.map_id, edge) for edge in item.edges]
-        if not keyframes and not edges:
             return
         try:
             with self._lock:
                 self._connection.execute("BEGIN IMMEDIATE")
-                self._connection.executemany("INSERT OR REPLACE INTO keyframes VALUES (?, ?, ?, ?, ?, ?)", keyframes)
-                self._connection.executemany("INSERT INTO edges VALUES (?, ?, ?, ?, ?, ?, ?)", edges)
+                for change in batch:
+                    self._apply(change)
                 self._connection.execute("COMMIT")
         except sqlite3.Error as error:
             # The robot goes on mapping in memory; the batch is tried again with the next one.
@@ -327,14 +343,58 @@ class MapStore:
             if not self.fault:
                 log.error("the map cannot be stored: %s; mapping goes on in memory", error)
             self.fault = str(error)
-            self.dropped += max(0, len(batch) - QUEUE_LENGTH)
+            self.dropped += sum(len(change.keyframes) for change in batch[:-QUEUE_LENGTH])
             self._failed = batch[-QUEUE_LENGTH:]
             return
         self._failed = []
         self.fault = ""
-        self.written += count
-        self._poses_written.update(written)
-        self._weights_written.update({(e[1], e[2], e[3]): e[6] for e in edges})
+        self.written += sum(len(change.keyframes) for change in batch)
+        for change in batch:
+            self._poses_written.update({keyframe.id: T for keyframe, T in change.keyframes})
+            self._weights_written.update({(e.kind, e.i, e.j): e.weight for e in change.edges})
+        gone = {key for change in batch for key in change.removed}
+        if gone:
+            self._poses_written = {k: T for k, T in self._poses_written.items() if k not in gone}
+            self._weights_written = {
+                key: w for key, w in self._weights_written.items() if key[1] not in gone and key[2] not in gone
+            }
+
+    def _apply(self, change: _Change) -> None:
+        many, map_id = self._connection.executemany, self.map_id
+        rows = [
+            (
+                map_id,
+                keyframe.id,
+                keyframe.stamp_ns + change.clock_offset_ns,
+                _pack_pose(keyframe.T_odom_base),
+                _pack_pose(T_map_base),
+                pack_points(keyframe.points),
+            )
+            for keyframe, T_map_base in change.keyframes
+        ]
+        many("INSERT OR REPLACE INTO keyframes VALUES (?, ?, ?, ?, ?, ?)", rows)
+        for merge in change.merged:
+            self._merge(merge)
+        many("UPDATE keyframes SET points = ? WHERE map_id = ? AND id = ?",
+             [(pack_points(np.zeros((0, 3))), map_id, key) for key in change.bare])  # fmt: skip
+        gone = [(map_id, key) for key in change.removed]
+        many("DELETE FROM edges WHERE map_id = ? AND j = ?", gone)
+        many("DELETE FROM edges WHERE map_id = ? AND i = ?", gone)
+        many("DELETE FROM keyframes WHERE map_id = ? AND id = ?", gone)
+        edges = [_edge_row(map_id, edge) for edge in change.edges]
+        many("INSERT INTO edges VALUES (?, ?, ?, ?, ?, ?, ?)", edges)
+
+    def _merge(self, merge: Merge) -> None:
+        """Points of a keyframe into the frame of another."""
+        execute = self._connection.execute
+        found = execute(
+            "SELECT id, points FROM keyframes WHERE map_id = ? AND id IN (?, ?)", (self.map_id, merge.into, merge.gone)
+        )
+        points = {key: unpack_points(data) for key, data in found}
+        if len(points) == 2:
+            moved = geometry.transform_points(merge.T_into_gone, points[merge.gone])
+            packed = pack_points(np.concatenate([points[merge.into], moved]))
+            execute("UPDATE keyframes SET points = ? WHERE map_id = ? AND id = ?", (packed, self.map_id, merge.into))
 
 
 def _pack_pose(T: FloatArray) -> bytes:

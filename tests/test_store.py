@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import sqlite3
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from robominer_slam import geometry
-from robominer_slam.slam.keyframe import BackendResult, GraphEdge, Keyframe
+from robominer_slam.slam.keyframe import BackendResult, GraphEdge, Keyframe, Merge
 from robominer_slam.store import MapStore, StoreError, open_database, pack_points, unpack_points
 from tests.conftest import planar
 
@@ -60,6 +61,39 @@ def test_each_run_is_a_map_of_its_own(tmp_path):
         with MapStore(tmp_path / "map.db", 0.1, "rm3", "") as store:
             store.add(result(0), 0)
     assert rows(tmp_path / "map.db", "SELECT map_id, id FROM keyframes") == [(1, 0), (2, 0)]
+
+
+def test_what_leaves_the_graph_leaves_the_store_and_its_touches_move(tmp_path):
+    """Keyframe 2 is merged into 1 and a bridge replaces its edges; keyframe 3 keeps no touches."""
+    path = tmp_path / "map.db"
+    last = result(4)
+    bridge = GraphEdge("odometry", 1, 3, planar(0.2, 0, 0), np.eye(6), 1.0)
+    change = replace(
+        last, added=[bridge, last.edges[-1]], removed=[2], bare=[3], merged=[Merge(2, 1, planar(0.1, 0, 0), 0.02)],
+        poses=np.delete(last.poses, 2, axis=0), ids=(0, 1, 3, 4),
+    )  # fmt: skip
+    with MapStore(path, 0.1, "rm3", "") as store:
+        for k in range(4):
+            store.add(result(k), 0)
+        store.add(change, 0)
+        assert store.flush(5.0)
+        store.save_poses(np.array([planar(0, 1.0 * i, 0) for i in (0, 1, 3, 4)]), [0, 1, 3, 4])
+    assert sorted(rows(path, "SELECT i, j FROM edges")) == [(0, 1), (1, 3), (3, 4)]
+    stored = {row[0]: row[1:] for row in rows(path, "SELECT id, points, T_map_base FROM keyframes")}
+    assert sorted(stored) == [0, 1, 3, 4]
+    both = np.concatenate([result(1).keyframe.points, result(2).keyframe.points + np.array([0.1, 0.0, 0.0])])
+    np.testing.assert_allclose(unpack_points(stored[1][0]), both, atol=1.1e-3)
+    assert len(unpack_points(stored[3][0])) == 0
+    np.testing.assert_allclose(np.frombuffer(stored[4][1]), geometry.to_vector7(planar(0, 4.0, 0)))
+
+
+def test_a_closure_that_waited_for_its_partner_is_stored_too(tmp_path):
+    late = GraphEdge("loop", 0, 2, planar(0.2, 0, 0), np.eye(6), 1.0)
+    with MapStore(tmp_path / "map.db", 0.1, "rm3", "") as store:
+        for k in range(3):
+            store.add(result(k), 0)
+        store.add(replace(result(3), added=[late, result(3).edges[-1]]), 0)
+    assert (0, 2) in rows(tmp_path / "map.db", "SELECT i, j FROM edges WHERE kind = 'loop'")
 
 
 def test_a_newer_database_is_refused_and_left_alone(tmp_path):

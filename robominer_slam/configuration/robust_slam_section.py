@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from robominer_slam.configuration.bounded_map_section import BoundedMapSection
 from robominer_slam.configuration.parameter import Section, parameter
 from robominer_slam.configuration.relocalisation_section import RelocalisationSection
 
@@ -110,3 +111,4 @@ class RobustSlamSection(Section):
     scan_matching: ScanMatchingSection = Field(default_factory=ScanMatchingSection)
     closure: ClosureSection = Field(default_factory=ClosureSection)
     relocalisation: RelocalisationSection = Field(default_factory=RelocalisationSection)
+    bounds: BoundedMapSection = Field(default_factory=BoundedMapSection)

@@ -25,7 +25,8 @@ DIGEST_BYTES = 8
 POSE = struct.Struct("<3i4h")
 _POINTS_DIGEST_BYTES = 16
 _STATE_HEAD = struct.Struct("<QII")
-_KEYFRAME_HEAD = struct.Struct("<IqI")
+_ID = struct.Struct("<I")
+_KEYFRAME_HEAD = struct.Struct("<qI")
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,12 +38,18 @@ class StreamKeyframe:
         pose: T_map_base as x y z (mm), qx qy qz qw (1/32767), with qw >= 0.
         points: shape (m, 3), mm, in base_link at the keyframe; every point once, sorted by x, y, z.
         points_digest: of the points.
+        packed: what of it goes into the state's digest, behind the id; follows from the others.
     """
 
     stamp_ns: int
     pose: tuple[int, ...]
     points: PointArray
     points_digest: bytes
+    packed: bytes = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        head = _KEYFRAME_HEAD.pack(self.stamp_ns, len(self.points))
+        object.__setattr__(self, "packed", head + POSE.pack(*self.pose) + self.points_digest)
 
     def vector7(self) -> FloatArray:
         """T_map_base as x y z (m), qx qy qz qw of length 1; shape (7,)."""
@@ -68,10 +75,8 @@ class MapState:
         """BLAKE2b of 8 bytes over the whole state, independent of how it came about."""
         state = hashlib.blake2b(digest_size=DIGEST_BYTES)
         state.update(_STATE_HEAD.pack(self.map_id, self.version, len(self.keyframes)))
-        for key in sorted(self.keyframes):
-            keyframe = self.keyframes[key]
-            head = _KEYFRAME_HEAD.pack(key, keyframe.stamp_ns, len(keyframe.points))
-            state.update(head + POSE.pack(*keyframe.pose) + keyframe.points_digest)
+        keyframes = self.keyframes
+        state.update(b"".join([_ID.pack(key) + keyframes[key].packed for key in sorted(keyframes)]))
         return state.digest()
 
     def cloud(self) -> FloatArray:

@@ -37,7 +37,7 @@ MAX_PAYLOAD_BYTES = 512 * 1024
 
 
 class SourceKeyframe(Protocol):
-    """What the encoder needs of a keyframe; its points (m, 3), m, in base_link never change."""
+    """What the encoder needs of a keyframe; its points (m, 3), m, in base_link are another array when they change."""
 
     @property
     def id(self) -> int:
@@ -68,6 +68,9 @@ class MapStreamEncoder:
         """
         self.state = MapState(map_id)
         self.points_left_out = 0
+        self._sources: dict[int, NDArray[np.floating]] = {}
+        self._sent_ids: list[int] = []
+        self._sent_poses = np.zeros((0, 7), dtype=np.int32)
         self._epoch = secrets.randbits(32)
 
     def update(
@@ -90,18 +93,26 @@ class MapStreamEncoder:
         """
         if version <= self.state.version:
             raise ValueError(f"map version {version} after {self.state.version}")
-        quantised = map_state.quantise_poses(poses).tolist()
+        quantised = map_state.quantise_poses(poses)
         if len(quantised) != len(keyframes):
             raise ValueError(f"{len(quantised)} poses of {len(keyframes)} keyframes")
         base = self.state.version
         records: list[Record] = []
-        here: set[int] = set()
-        for source, pose in zip(keyframes, quantised, strict=True):
-            here.add(source.id)
-            records += self._take(source, tuple(pose), clock_offset_ns)
-        for gone in sorted(self.state.keyframes.keys() - here):
+        ids = [source.id for source in keyframes]
+        common = _common_length(ids, self._sent_ids)
+        sent = quantised.copy()
+        moved = np.ones(len(ids), dtype=np.bool_)
+        moved[:common] = _moved(self._sent_poses[:common], quantised[:common])
+        sent[:common][~moved[:common]] = self._sent_poses[:common][~moved[:common]]
+        for place, (source, changed) in enumerate(zip(keyframes, moved.tolist(), strict=True)):
+            if changed or self._sources.get(source.id) is not source.points:
+                records += self._take(source, tuple(quantised[place].tolist()), clock_offset_ns)
+                sent[place] = self.state.keyframes[source.id].pose
+        for gone in sorted(self.state.keyframes.keys() - set(ids)):
             del self.state.keyframes[gone]
+            del self._sources[gone]
             records.append(RemoveRecord(gone))
+        self._sent_ids, self._sent_poses = ids, sent
         self.state.version = version
         return self._messages(Kind.UPDATE, base, records)
 
@@ -123,13 +134,14 @@ class MapStreamEncoder:
 
     def _take(self, source: SourceKeyframe, pose: tuple[int, ...], clock_offset_ns: int) -> Iterable[Record]:
         known = self.state.keyframes.get(source.id)
-        if known is None:
+        if known is None or self._sources[source.id] is not source.points:
+            self._sources[source.id] = source.points
             points, left_out = map_state.quantise_points(source.points)
             self.points_left_out += left_out
             new = map_state.keyframe(source.stamp_ns + clock_offset_ns, pose, points)
             self.state.keyframes[source.id] = new
             return _new_keyframe(source.id, new)
-        if not _moved(known.pose, pose):
+        if not _moved(np.array([known.pose]), np.array([pose]))[0]:
             return ()
         self.state.keyframes[source.id] = replace(known, pose=pose)
         return (PoseRecord(source.id, pose),)
@@ -153,10 +165,18 @@ def _new_keyframe(key: int, keyframe: map_state.StreamKeyframe) -> Iterator[Reco
         yield PointsRecord(key, keyframe.points)
 
 
-def _moved(old: tuple[int, ...], new: tuple[int, ...]) -> bool:
-    limit = POSITION_TOLERANCE * map_state.MILLIMETRES_PER_METRE
-    if any(abs(a - b) >= limit for a, b in zip(old[:3], new[:3], strict=True)):
-        return True
+def _common_length(a: list[int], b: list[int]) -> int:
+    """How many ids two lists have in common at their beginning."""
+    shorter = min(len(a), len(b))
+    if a[:shorter] == b[:shorter]:
+        return shorter
+    return next(k for k in range(shorter) if a[k] != b[k])
+
+
+def _moved(old: NDArray[np.int32], new: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """Which poses, shape (n, 7), have moved enough to be sent again, shape (n,)."""
+    off = np.abs(new.astype(np.int64) - old)
+    far = off[:, :3] >= POSITION_TOLERANCE * map_state.MILLIMETRES_PER_METRE
     # A small turn by an angle changes the quaternion by half of it.
-    limit = 0.5 * ANGLE_TOLERANCE * map_state.QUATERNION_UNIT
-    return any(abs(a - b) >= limit for a, b in zip(old[3:], new[3:], strict=True))
+    turned = off[:, 3:] >= 0.5 * ANGLE_TOLERANCE * map_state.QUATERNION_UNIT
+    return np.asarray(far.any(axis=1) | turned.any(axis=1))

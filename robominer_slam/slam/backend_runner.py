@@ -13,7 +13,7 @@ import time
 from collections import deque
 from typing import Protocol
 
-from robominer_slam.slam.keyframe import Backend, BackendResult, Keyframe
+from robominer_slam.slam.keyframe import Backend, BackendResult, Keyframe, ReleasesMemory
 
 
 class BackendRunner(Protocol):
@@ -154,3 +154,6 @@ class ThreadedRunner:
                 self.busy_s += time.perf_counter() - start
         except BaseException as error:  # noqa: BLE001 - raised in the front-end's thread at its next call
             self._failure = error
+        finally:
+            if isinstance(self._backend, ReleasesMemory):
+                self._backend.release()

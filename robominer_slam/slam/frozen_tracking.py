@@ -13,8 +13,8 @@ from robominer_slam import geometry
 from robominer_slam.configuration.robust_slam_section import RobustSlamSection
 from robominer_slam.slam.keyframe import Keyframe
 from robominer_slam.slam.map_ground import MapGround
+from robominer_slam.slam.published_edges import PLANAR
 from robominer_slam.slam.relocalisation import SessionKeyframe, carried, relative, thinned
-from robominer_slam.slam.robust import PLANAR
 from robominer_slam.slam.surface_registration import YAW, SurfaceMatch, fit, height_left_free, placed
 
 FloatArray = NDArray[np.float64]

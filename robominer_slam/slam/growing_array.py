@@ -34,3 +34,11 @@ class GrowingArray:
             self._buffer = grown
         self._buffer[self._count : end] = added
         self._count = end
+
+    def keep(self, kept: NDArray[np.bool_]) -> None:
+        """Drop the rows where `kept`, shape (n,), is False; the others close up in their order."""
+        rows = self.view[kept]
+        self._count = len(rows)
+        self._buffer[: self._count] = rows
+        if self._buffer.shape[0] > 4 * max(self._count, 16):
+            self._buffer = self._buffer[: 2 * max(self._count, 16)].copy()

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal, Protocol
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,13 +67,29 @@ class GraphEdge:
 
 
 @dataclass(frozen=True, slots=True)
+class Merge:
+    """A keyframe whose touches move into the frame of another before it goes.
+
+    Attributes:
+        gone, into: ids.
+        T_into_gone: pose of the one in the other, shape (4, 4).
+        voxel: touches closer than this become one, m.
+    """
+
+    gone: int
+    into: int
+    T_into_gone: FloatArray
+    voxel: float
+
+
+@dataclass(frozen=True, slots=True)
 class BackendResult:
     """The graph after a keyframe was taken in.
 
     Attributes:
         keyframe: the one that was taken in.
         T_map_odom: correction that holds from its effect on, shape (4, 4).
-        poses: of all keyframes in map, shape (n, 4, 4).
+        poses: of all keyframes that are in the graph, in map, in the order of their ids, shape (n, 4, 4).
         covariance: of the keyframe's (x, y, yaw) in map, shape (3, 3).
         edges: of the whole graph.
         closures: loop closures added by this keyframe.
@@ -82,6 +98,11 @@ class BackendResult:
             known there are none, and all that were made meanwhile enter together when it is.
         ids: of the keyframes that `poses` are of; None for 0, 1, 2, ...
         localised: whether the keyframe's place in the map is known.
+        added: edges that were not in the result before; None where the back-end does not say.
+        removed: ids of keyframes that have left the graph with all their edges.
+        merged: which of these hand their touches to a neighbour, in order.
+        bare: ids of keyframes that keep no touches: the map has their ground from others.
+        counts: what the back-end has counted so far, by name.
     """
 
     keyframe: Keyframe
@@ -94,6 +115,11 @@ class BackendResult:
     entered: tuple[Keyframe, ...] | None = None
     ids: tuple[int, ...] | None = None
     localised: bool = True
+    added: Sequence[GraphEdge] | None = None
+    removed: Sequence[int] = ()
+    merged: Sequence[Merge] = ()
+    bare: Sequence[int] = ()
+    counts: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def new_keyframes(self) -> tuple[Keyframe, ...]:
@@ -111,4 +137,13 @@ class Backend(Protocol):
 
     def process(self, keyframe: Keyframe) -> BackendResult:
         """Add a keyframe, search for loop closures, optimise."""
+        ...
+
+
+@runtime_checkable
+class ReleasesMemory(Protocol):
+    """A back-end with memory that must be freed in the thread that made it."""
+
+    def release(self) -> None:
+        """Free it; the back-end is not used again."""
         ...

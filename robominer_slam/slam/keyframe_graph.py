@@ -3,12 +3,12 @@
 Gravity tells roll and pitch far better than touches do, so they are taken from the odometry; what is left are four
 unknowns per keyframe. The plane's three are solved together with the slow biases (`pose_graph_bias`); heights are a
 linear problem of their own.
+
+A closure that says what the graph expects need not move all of it: `optimise_window` solves for the last keyframes
+alone, held by those before them at their present poses.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,144 +17,156 @@ from scipy.sparse.linalg import splu
 
 from robominer_slam import geometry
 from robominer_slam.slam import pose_graph_bias
+from robominer_slam.slam.graph_marginals import GraphMarginals
+from robominer_slam.slam.keyframe_nodes import KeyframeNodes
+from robominer_slam.slam.level_edges import LevelEdge, LevelEdges
 from robominer_slam.slam.pose_graph_bias import BiasProblem
 from robominer_slam.slam.pose_graph_optimizer import Kernels
 from robominer_slam.slam.pose_graph_system import SystemPattern
 
+__all__ = ["KeyframeGraph", "LevelEdge"]
+
 FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.intp]
 
 
-@dataclass
-class LevelEdge:
-    """A constraint between two keyframes, level.
-
-    Attributes:
-        kind: of odometry or of a loop closure.
-        i, j: ids of the keyframes.
-        Z: pose of j in i: x, y (m), heading (rad), shape (3,).
-        information: of it, as a twist in j's frame, shape (3, 3).
-        dz: height of j over i, m.
-        dz_information: 1/m2.
-        jacobian: what the slow biases do to Z, shape (3, nb).
-        reference: the biases that Z was made with, shape (nb,).
-        enabled: False where a closure was taken back.
-        chi2: squared error at the last optimum.
-    """
-
-    kind: Literal["odometry", "loop"]
-    i: int
-    j: int
-    Z: FloatArray
-    information: FloatArray
-    dz: float
-    dz_information: float
-    jacobian: FloatArray
-    reference: FloatArray
-    enabled: bool = True
-    chi2: float = 0.0
-
-
-@dataclass
 class KeyframeGraph:
-    """Nodes by id, edges in the order of their making.
+    """Nodes and edges, and the biases that the odometry edges share.
 
     Attributes:
-        poses: x, y, heading of each node in map, by id.
-        heights: z of each node in map, by id, m.
-        edges: all of them, those taken back too.
+        nodes: keyframes by id.
+        edges: all of them in the order of their making, those taken back too.
         bias: estimate of the slow biases, shape (nb,).
         bias_prior, bias_prior_information: what the odometry alone says of them.
     """
 
-    poses: dict[int, FloatArray] = field(default_factory=dict)
-    heights: dict[int, float] = field(default_factory=dict)
-    edges: list[LevelEdge] = field(default_factory=list)
-    bias: FloatArray = field(default_factory=lambda: np.zeros(0))
-    bias_prior: FloatArray = field(default_factory=lambda: np.zeros(0))
-    bias_prior_information: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    def __init__(self) -> None:
+        self.nodes = KeyframeNodes()
+        self.edges = LevelEdges()
+        self.bias: FloatArray = np.zeros(0)
+        self.bias_prior: FloatArray = np.zeros(0)
+        self.bias_prior_information: FloatArray = np.zeros((0, 0))
+        self._pattern: tuple[tuple[int, int], SystemPattern] | None = None
 
     def optimise(self) -> None:
         """Move all keyframes and the biases to the least squared error; the first keyframe stays."""
-        if len(self.poses) < 2:
+        if len(self.nodes) < 2:
             return
-        ids, problem, system, kernels = self._problem()
-        start = np.array([self.poses[k] for k in ids])
-        found = pose_graph_bias.solve(problem, kernels, start, self.bias, system)
-        for k, pose in zip(ids, found.poses, strict=True):
-            self.poses[k] = pose
+        problem, system, kernels = self._problem()
+        found = pose_graph_bias.solve(problem, kernels, self.nodes.poses.copy(), self.bias, system)
+        self.nodes.poses[:] = found.poses
         self.bias = found.bias
-        self._optimise_heights(ids)
+        self._solve_heights(1)
+        self.update_chi2()
+
+    def optimise_window(self, count: int) -> None:
+        """Move the last `count` keyframes to the least squared error; the others and the biases stay.
+
+        Uncertainty of what is held does not enter: meant for closures that agree with the graph as it is.
+        """
+        first = max(1, len(self.nodes) - count)
+        i, j, rows = self._ends(self.edges.enabled & (self.edges.j >= self.nodes.ids[first]))
+        nodes, places = np.unique(np.concatenate([i, j]), return_inverse=True)
+        i, j = places[: len(rows)], places[len(rows) :]
+        edges = self.edges
+        problem = BiasProblem(
+            i.astype(np.int64),
+            j.astype(np.int64),
+            self._measured(rows),
+            edges.information[rows],
+            np.zeros((len(rows), 3, 0)),
+            np.zeros((len(rows), 0)),
+            np.zeros(0),
+            np.zeros((0, 0)),
+        )
+        system = SystemPattern(problem.i, problem.j, nodes < first, 3)
+        kernels = Kernels(np.zeros(len(rows), dtype=np.int8), np.ones(len(rows)))
+        found = pose_graph_bias.solve(problem, kernels, self.nodes.poses[nodes], np.zeros(0), system)
+        self.nodes.poses[nodes] = found.poses
+        self._solve_heights(first)
         self.update_chi2()
 
     def update_chi2(self) -> None:
         """Squared errors of all edges at the present poses, those taken back included."""
-        if not self.edges:
+        edges = self.edges
+        if not len(edges):
             return
-        i = np.array([self.poses[e.i] for e in self.edges])
-        j = np.array([self.poses[e.j] for e in self.edges])
-        twist = np.array([e.jacobian @ (self.bias - e.reference) for e in self.edges])
-        Z = geometry.se2_compose(np.array([e.Z for e in self.edges]), geometry.se2_exp(twist))
-        error = geometry.se2_log(
-            geometry.se2_compose(geometry.se2_inverse(Z), geometry.se2_compose(geometry.se2_inverse(i), j))
-        )
-        Omega = np.array([e.information for e in self.edges])
-        chi2 = np.einsum("mi,mij,mj->m", error, Omega, error)
-        for edge, value in zip(self.edges, chi2, strict=True):
-            edge.chi2 = float(value)
+        poses = self.nodes.poses
+        i, j, rows = self._ends(np.ones(len(edges), dtype=np.bool_))
+        relative = geometry.se2_compose(geometry.se2_inverse(poses[i]), poses[j])
+        error = geometry.se2_log(geometry.se2_compose(geometry.se2_inverse(self._measured(rows)), relative))
+        edges.chi2[:] = np.einsum("mi,mij,mj->m", error, edges.information, error)
 
     def relative(self, i: int, j: int) -> FloatArray:
         """Pose (x, y, heading) of keyframe j in keyframe i, shape (3,)."""
-        return geometry.se2_compose(geometry.se2_inverse(self.poses[i]), self.poses[j])
+        return geometry.se2_compose(geometry.se2_inverse(self.nodes[i]), self.nodes[j])
+
+    def marginals(self) -> GraphMarginals:
+        """Covariances at the present poses, by one factorisation."""
+        problem, system, kernels = self._problem()
+        return GraphMarginals(problem, kernels, self.nodes.poses.copy(), self.bias, system)
 
     def covariance(self, nodes: list[int]) -> FloatArray:
         """Joint covariance of keyframes, shape (3 k, 3 k), each as a twist in its own frame."""
-        ids, problem, system, kernels = self._problem()
-        place = {k: n for n, k in enumerate(ids)}
-        poses = np.array([self.poses[k] for k in ids])
-        return pose_graph_bias.joint_covariance(problem, kernels, poses, self.bias, system, [place[k] for k in nodes])
+        return self.marginals().joint([self.nodes.row(k) for k in nodes])
 
-    def relative_covariance(self, i: int, j: int) -> FloatArray:
-        """Covariance of `relative(i, j)` as a twist in the frame of j, shape (3, 3)."""
-        Ad = geometry.se2_adjoint(geometry.se2_inverse(self.relative(i, j)))
-        A = np.concatenate([-Ad, np.eye(3)], axis=1)
-        return np.asarray(A @ self.covariance([i, j]) @ A.T)
+    def odometry_between(self, a: int, b: int) -> FloatArray:
+        """Covariance of the odometry between two keyframes, summed along the way; as of steps, arms left out."""
+        if not len(self.edges):
+            return np.zeros((3, 3))
+        edges = self.edges
+        steps = ~edges.loop & (edges.j > min(a, b)) & (edges.j <= max(a, b))
+        return np.asarray(np.add.reduce(edges.covariance[steps], axis=0))
 
-    def _problem(self) -> tuple[list[int], BiasProblem, SystemPattern, Kernels]:
-        ids = sorted(self.poses)
-        place = {k: n for n, k in enumerate(ids)}
-        edges = [e for e in self.edges if e.enabled]
-        i = np.array([place[e.i] for e in edges], dtype=np.int64)
-        j = np.array([place[e.j] for e in edges], dtype=np.int64)
+    def _measured(self, rows: IndexArray) -> FloatArray:
+        """Edges' Z at the present biases, shape (m, 3)."""
+        edges = self.edges
+        twist = (edges.jacobian[rows] @ (self.bias - edges.reference[rows])[:, :, None])[:, :, 0]
+        return geometry.se2_compose(edges.Z[rows], geometry.se2_exp(twist))
+
+    def _ends(self, chosen: NDArray[np.bool_]) -> tuple[IndexArray, IndexArray, IndexArray]:
+        """Nodes' places that chosen edges join, and the edges' rows, shape (m,) each."""
+        rows = np.flatnonzero(chosen)
+        return self.nodes.rows(self.edges.i[rows]), self.nodes.rows(self.edges.j[rows]), rows
+
+    def _problem(self) -> tuple[BiasProblem, SystemPattern, Kernels]:
+        edges = self.edges
+        i, j, rows = self._ends(edges.enabled)
         problem = BiasProblem(
-            i,
-            j,
-            np.array([e.Z for e in edges]),
-            np.array([e.information for e in edges]),
-            np.array([e.jacobian for e in edges]),
-            np.array([e.reference for e in edges]),
+            i.astype(np.int64),
+            j.astype(np.int64),
+            edges.Z[rows],
+            edges.information[rows],
+            edges.jacobian[rows],
+            edges.reference[rows],
             self.bias_prior,
             self.bias_prior_information,
         )
-        fixed = np.zeros(len(ids), dtype=np.bool_)
-        fixed[0] = True
-        kernels = Kernels(np.zeros(len(edges), dtype=np.int8), np.ones(len(edges)))
-        return ids, problem, SystemPattern(i, j, fixed, 3), kernels
+        kernels = Kernels(np.zeros(len(rows), dtype=np.int8), np.ones(len(rows)))
+        version = (self.nodes.version, edges.version)
+        if self._pattern is None or self._pattern[0] != version:
+            fixed = np.zeros(len(self.nodes), dtype=np.bool_)
+            fixed[0] = True
+            self._pattern = version, SystemPattern(problem.i, problem.j, fixed, 3)
+        return problem, self._pattern[1], kernels
 
-    def _optimise_heights(self, ids: list[int]) -> None:
-        edges = [e for e in self.edges if e.enabled]
-        place = {k: n for n, k in enumerate(ids)}
-        i = np.array([place[e.i] for e in edges])
-        j = np.array([place[e.j] for e in edges])
-        w = np.array([e.dz_information for e in edges])
-        d = np.array([e.dz for e in edges])
-        n = len(ids)
-        rows = np.concatenate([i, j, i, j])
-        columns = np.concatenate([i, j, j, i])
-        values = np.concatenate([w, w, -w, -w])
-        L = csc_matrix((values, (rows, columns)), shape=(n, n))
-        right = np.bincount(j, w * d, n) - np.bincount(i, w * d, n)
-        z = np.zeros(n)
-        z[1:] = splu(L[1:, 1:].tocsc(), permc_spec="MMD_AT_PLUS_A").solve(right[1:])
-        first = self.heights[ids[0]]
-        for k, height in zip(ids, z, strict=True):
-            self.heights[k] = float(first + height)
+    def _solve_heights(self, first: int) -> None:
+        """Heights of least squared error of the nodes from place `first` on; those before stay."""
+        edges, z = self.edges, self.nodes.heights
+        i, j, rows = self._ends(edges.enabled & (edges.j >= self.nodes.ids[first]))
+        w, d = edges.dz_information[rows], edges.dz[rows]
+        held, n = first, len(self.nodes)
+        # About the first held height: small numbers lose no digits.
+        datum = z[0]
+        known = np.where(np.arange(n) < held, z - datum, 0.0)
+        d = d - known[j] + known[i]
+        a, b = i - held, j - held
+        f = n - held
+        both = (a >= 0) & (b >= 0)
+        on_a, on_b = a >= 0, b >= 0
+        rows_ = np.concatenate([a[on_a], b[on_b], a[both], b[both]])
+        columns = np.concatenate([a[on_a], b[on_b], b[both], a[both]])
+        values = np.concatenate([w[on_a], w[on_b], -w[both], -w[both]])
+        L = csc_matrix((values, (rows_, columns)), shape=(f, f))
+        right = np.bincount(b[on_b], (w * d)[on_b], f) - np.bincount(a[on_a], (w * d)[on_a], f)
+        z[held:] = datum + splu(L, permc_spec="MMD_AT_PLUS_A").solve(right)

@@ -15,8 +15,10 @@ from robominer_slam import geometry
 from robominer_slam.slam.closure_search import Patch
 from robominer_slam.slam.composite_scan import voxel_filter
 from robominer_slam.slam.keyframe import GraphEdge
-from robominer_slam.slam.keyframe_graph import LevelEdge
-from robominer_slam.slam.robust import PLANAR, levelled
+from robominer_slam.slam.keyframe_nodes import KeyframeNodes
+from robominer_slam.slam.level_edges import LevelEdge
+from robominer_slam.slam.published_edges import PLANAR
+from robominer_slam.slam.robust import levelled
 from robominer_slam.slam.saved_map import SavedMap
 from robominer_slam.slam.surface_registration import placed
 
@@ -35,13 +37,15 @@ class LevelMap:
         poses: x, y (m), heading (rad) of each keyframe in map, by id.
         heights: of each, m.
         tilts: R of each with R_map_base = R_z(heading) R, shape (3, 3).
-        patches: touches of each, in its level frame.
+        travelled: way driven up to each, m.
+        patches: touches of those that have any, in their level frames.
         edges: between them.
     """
 
     poses: dict[int, FloatArray] = field(default_factory=dict)
     heights: dict[int, float] = field(default_factory=dict)
     tilts: dict[int, FloatArray] = field(default_factory=dict)
+    travelled: dict[int, float] = field(default_factory=dict)
     patches: dict[int, Patch] = field(default_factory=dict)
     edges: list[LevelEdge] = field(default_factory=list)
 
@@ -56,6 +60,14 @@ class LevelMap:
         distance = np.hypot(*(np.array([self.poses[k][:2] for k in ids]) - xy).T)
         return ids[int(np.argmin(distance))]
 
+    def nodes(self, shift: float) -> KeyframeNodes:
+        """As nodes of a graph; `shift` is added to the ways driven, m."""
+        nodes = KeyframeNodes()
+        for k in sorted(self.poses):
+            nodes.append(k, self.poses[k], self.heights[k], self.tilts[k], self.travelled[k] + shift)
+        nodes.mapped[:] = [k in self.patches for k in nodes.ids.tolist()]
+        return nodes
+
     def without(self, gone: Collection[int]) -> LevelMap:
         """The map without some keyframes."""
         left = [k for k in self.poses if k not in gone]
@@ -63,6 +75,7 @@ class LevelMap:
             {k: self.poses[k] for k in left},
             {k: self.heights[k] for k in left},
             {k: self.tilts[k] for k in left},
+            {k: self.travelled[k] for k in left},
             {k: self.patches[k] for k in left if k in self.patches},
             [e for e in self.edges if e.i not in gone and e.j not in gone],
         )
@@ -79,7 +92,9 @@ def from_saved(saved: SavedMap, voxel: float) -> LevelMap:
         level, tilt = levelled(T)
         k = keyframe.id
         known.poses[k], known.heights[k], known.tilts[k] = level[:3], float(level[3]), tilt
-        known.patches[k] = Patch(voxel_filter(keyframe.floor_points @ tilt.T, voxel), keyframe.travelled)
+        known.travelled[k] = keyframe.travelled
+        if len(keyframe.points):
+            known.patches[k] = Patch(voxel_filter(keyframe.floor_points @ tilt.T, voxel), keyframe.travelled)
     known.edges = [_levelled_edge(edge, known) for edge in saved.edges]
     known.edges += _chain(known)
     return known

@@ -10,7 +10,7 @@ searched for what they touched: a second opinion. The map never gets them if the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,6 +25,7 @@ from robominer_slam.slam.frozen_tracking import FrozenTracker
 from robominer_slam.slam.keyframe import BackendResult, GraphEdge, Keyframe
 from robominer_slam.slam.level_map import LevelMap, from_saved
 from robominer_slam.slam.map_ground import MapGround
+from robominer_slam.slam.patch_memory import PatchPages
 from robominer_slam.slam.place_prior import PlacePrior
 from robominer_slam.slam.relocalisation import Place, Relocaliser, SessionKeyframe
 from robominer_slam.slam.robust import levelled
@@ -32,6 +33,7 @@ from robominer_slam.slam.saved_map import SavedMap
 from robominer_slam.slam.session_backend import SessionBackend
 from robominer_slam.slam.surface import SurfaceModel
 from robominer_slam.slam.surface_registration import YAW
+from robominer_slam.slam.untold_changes import UntoldChanges
 
 FloatArray = NDArray[np.float64]
 
@@ -42,19 +44,29 @@ UNKNOWN = np.diag([100.0, 100.0, 10.0])
 class LocalisedBackend:
     """Takes keyframes one after the other; deterministic."""
 
-    def __init__(self, parameters: RobustSlamSection, known: SavedMap | None = None, frozen: bool = False) -> None:
+    def __init__(
+        self,
+        parameters: RobustSlamSection,
+        known: SavedMap | None = None,
+        frozen: bool = False,
+        pages: Callable[[], PatchPages] | None = None,
+    ) -> None:
         """Start with an empty map, or with a known one in which the place is to be found.
 
         Args:
             parameters: with units and reasons there.
             known: the map; None to begin a new one.
             frozen: whether it must stay as it is.
+            pages: makes a place for touches that do not fit into memory; None keeps all there.
         """
         self._parameters = parameters
         s = parameters.surface
         self._model = SurfaceModel(s.touch_sigma, s.curvature, s.slope_sigma, s.reach)
         self._frozen = frozen
-        self._session = SessionBackend(parameters)
+        self._pages = pages
+        self._session = self._new_session()
+        self._untold = UntoldChanges()
+        self._counts: Mapping[str, int] = {}
         self._held: list[Keyframe] = []
         self._T_map_odom = np.eye(4)
         self._version = 0
@@ -82,8 +94,19 @@ class LocalisedBackend:
             self._replaced(keyframe.prior)
         if self._frozen:
             return self._followed(keyframe)
+        # What is held back may turn out to be elsewhere: until then nothing goes because of it.
+        self._session.bounded = self.localised and not self._held
         result = self._session.process(keyframe)
+        self._untold.note(result)
+        self._counts = result.counts
         return self._mapped(keyframe, result) if self.localised else self._searched(keyframe)
+
+    def release(self) -> None:
+        """Let go of what must be freed in the thread that made it."""
+        self._session.release()
+
+    def _new_session(self) -> SessionBackend:
+        return SessionBackend(self._parameters, None if self._pages is None else self._pages())
 
     # -------------------------------------------------------------------------------------------- looking for it
 
@@ -95,8 +118,8 @@ class LocalisedBackend:
         self._base = base
         self._relocaliser = Relocaliser(p, self._ground, self._parameters.closure.inflation)
         self._tracker = self._second_opinion = None
-        self._session = SessionBackend(self._parameters)
-        self._held = []
+        self._session = self._new_session()
+        self._held, self._untold.edges = [], []
         self._doubts = Doubts(self._parameters.relocalisation)
         if prior is not None:
             self._relocaliser.expect(prior)
@@ -105,7 +128,7 @@ class LocalisedBackend:
         """The operator says where the robot is now; how it came there is not known."""
         base = self._base
         if self.localised and not self._frozen:
-            base = self._session.level_map().without({k.id for k in self._held})
+            base = self._settled()
         if base.poses:
             self._search_in(base, prior)
 
@@ -123,12 +146,16 @@ class LocalisedBackend:
         self._session.adopt(self._base, origin, ties)
         self._relocaliser, self._ground, self._base = None, None, LevelMap()
         entered, self._held = tuple(self._held), []
-        return self._known(self._session.present(keyframe, len(ties)), entered)
+        result = self._session.present(keyframe, len(ties))
+        had = {(e.kind, e.i, e.j) for e in self._edges}
+        self._untold.edges += [e for e in result.added or () if (e.kind, e.i, e.j) not in had]
+        return self._known(result, entered)
 
     def _unknown(self, keyframe: Keyframe) -> BackendResult:
         return BackendResult(
-            keyframe, self._T_map_odom, self._poses, UNKNOWN, self._edges, 0, self._version, (), self._ids, False
-        )
+            keyframe, self._T_map_odom, self._poses, UNKNOWN, self._edges, 0, self._version, (), self._ids, False,
+            added=(), counts=self._counts,
+        )  # fmt: skip
 
     def _tie(self, place: Place, found_by: Relocaliser) -> Closure:
         """A place that was found, as a closure with the nearest keyframe of the map."""
@@ -164,25 +191,31 @@ class LocalisedBackend:
         return self._known(result, entered)
 
     def _doubted(self, keyframe: Keyframe, result: BackendResult) -> BackendResult:
-        base = self._session.level_map().without({k.id for k in self._held})
-        if not base.poses:
+        if len(self._session.ids) == len(self._held):
             self._doubts.clear()
             entered, self._held = tuple(self._held), []
             return self._known(result, entered)
-        place = self._asked(base, self._held if self._second_opinion is None else [keyframe])
+        if self._ground is None:
+            p = self._parameters
+            touches = self._settled().touches()
+            self._ground = MapGround(touches, self._model, p.point_voxel, p.relocalisation.cell, p.relocalisation.reach)
+        place = self._asked(self._held if self._second_opinion is None else [keyframe])
         if place is not None and self._near(place.pose, self._session.pose(keyframe.id)):
             self._doubts.clear()
         elif place is not None or self._doubts.carried_away:
-            return self._carried_away(base, keyframe, place)
+            return self._carried_away(self._settled(), keyframe, place)
         return replace(self._known(result, ()), localised=not self._doubts.broken)
 
-    def _asked(self, base: LevelMap, keyframes: Sequence[Keyframe]) -> Place | None:
+    def _settled(self) -> LevelMap:
+        """The map without the keyframes that are held back."""
+        return self._session.level_map().without({k.id for k in self._held})
+
+    def _asked(self, keyframes: Sequence[Keyframe]) -> Place | None:
         """Where the whole map says that the newest keyframe is, if it is sure."""
-        p = self._parameters.relocalisation
-        if self._ground is None:
-            self._ground = MapGround(base.touches(), self._model, self._parameters.point_voxel, p.cell, p.reach)
         if self._second_opinion is None:
-            self._second_opinion = Relocaliser(p, self._ground, self._parameters.closure.inflation)
+            assert self._ground is not None
+            p = self._parameters
+            self._second_opinion = Relocaliser(p.relocalisation, self._ground, p.closure.inflation)
         place = None
         for one in keyframes:
             place = self._second_opinion.add(self._session_keyframe(one))
@@ -194,10 +227,12 @@ class LocalisedBackend:
         assert found_by is not None
         self._base, self._relocaliser = base, found_by
         self._second_opinion = None
-        self._session = SessionBackend(self._parameters)
+        self._session = self._new_session()
+        self._session.bounded = False
         self._doubts = Doubts(self._parameters.relocalisation)
+        self._untold.edges = []
         for one in held:
-            self._session.process(one)
+            self._untold.note(self._session.process(one))
         return self._unknown(keyframe) if place is None else self._joined(keyframe, place, found_by)
 
     def _near(self, a: FloatArray, b: FloatArray) -> bool:
@@ -208,8 +243,9 @@ class LocalisedBackend:
         """A result of the session's graph, without the keyframes that are held back."""
         ids = self._session.ids
         poses, edges = result.poses, result.edges
-        if self._held:
-            held = {k.id for k in self._held}
+        held = {k.id for k in self._held}
+        result = self._untold.told(result, held)
+        if held:
             kept = [n for n, k in enumerate(ids) if k not in held]
             ids, poses = tuple(ids[n] for n in kept), poses[kept]
             edges = tuple(e for e in edges if e.i not in held and e.j not in held)
@@ -233,7 +269,7 @@ class LocalisedBackend:
             if not self._doubts.any and not self._tracker.uncertain:
                 self._second_opinion = None
             else:
-                place = self._asked(self._base, [keyframe])
+                place = self._asked([keyframe])
                 assert self._second_opinion is not None
                 here = place is not None and self._near(place.pose, self._tracker.pose)
                 if place is not None and (self._tracker.uncertain or not here):
@@ -251,7 +287,7 @@ class LocalisedBackend:
         self._T_map_odom = geometry.normalise_pose(T @ geometry.inverse(keyframe.T_odom_base))
         return BackendResult(
             keyframe, self._T_map_odom, self._poses, self._tracker.covariance.copy(), self._edges, 0, self._version,
-            (), self._ids, not self._doubts.broken,
+            (), self._ids, not self._doubts.broken, added=(),
         )  # fmt: skip
 
     def _track(self, keyframe: SessionKeyframe, place: Place, found_by: Relocaliser) -> None:

@@ -101,13 +101,13 @@ def solve(
     Raises:
         SingularSystemError: the edges leave a direction free.
     """
-    costs, cost = _evaluate(problem, kernels, poses, bias)
+    costs, cost = evaluate(problem, kernels, poses, bias)
     iterations = 0
     free = system.free_nodes
     while iterations < max_iterations:
         iterations += 1
         pivot = poses[:, :2].mean(axis=0)
-        factors, step_x, step_b, promised, _, _ = _linearised(problem, costs, poses, bias, pivot, system)
+        factors, step_x, step_b, promised, _, _ = linearised(problem, costs, poses, bias, pivot, system)
         del factors
         if promised <= tolerance * cost + 1e-12:
             break
@@ -115,7 +115,7 @@ def solve(
             candidate = poses.copy()
             candidate[free] = residuals.perturbed(2, poses[free], length * step_x, pivot)
             candidate_bias = bias + length * step_b
-            new_costs, new_cost = _evaluate(problem, kernels, candidate, candidate_bias)
+            new_costs, new_cost = evaluate(problem, kernels, candidate, candidate_bias)
             if new_cost < cost:
                 break
         if not new_cost < cost:
@@ -127,44 +127,14 @@ def solve(
     return BiasSolution(poses, bias, costs.squared, iterations)
 
 
-def joint_covariance(
-    problem: BiasProblem,
-    kernels: Kernels,
-    poses: FloatArray,
-    bias: FloatArray,
-    system: SystemPattern,
-    nodes: list[int],
-) -> FloatArray:
-    """Joint covariance of chosen nodes, shape (3 k, 3 k), each as a twist in its own frame; 0 for fixed nodes.
-
-    The bias's uncertainty is in it.
-    """
-    k = len(nodes)
-    pivot = poses[:, :2].mean(axis=0)
-    costs, _ = _evaluate(problem, kernels, poses, bias)
-    factors, _, _, _, by_bias, S = _linearised(problem, costs, poses, bias, pivot, system)
-    f = system.free_nodes.size
-    place = np.full(poses.shape[0], -1)
-    place[system.free_nodes] = np.arange(f)
-    to_node = residuals.world_to_node(2, poses[nodes], pivot)
-    selected = np.zeros((f, 3, k, 3))
-    for column, node in enumerate(nodes):
-        if place[node] >= 0:
-            selected[place[node], :, column] = to_node[column].T
-    columns = selected.reshape(f * 3, k * 3)
-    covariance = columns.T @ factors.solve(columns)
-    spread = columns.T @ by_bias
-    covariance = covariance + spread @ np.linalg.solve(S, spread.T)
-    return np.asarray(0.5 * (covariance + covariance.T))
-
-
-def _evaluate(problem: BiasProblem, kernels: Kernels, poses: FloatArray, bias: FloatArray) -> tuple[EdgeCosts, float]:
+def evaluate(problem: BiasProblem, kernels: Kernels, poses: FloatArray, bias: FloatArray) -> tuple[EdgeCosts, float]:
+    """Errors of all edges, and the cost with that of the bias's prior."""
     costs = edge_costs(problem.edges(bias), kernels, poses, "gtsam")
     off = bias - problem.prior
     return costs, costs.cost + float(off @ problem.prior_information @ off)
 
 
-def _linearised(
+def linearised(
     problem: BiasProblem,
     costs: EdgeCosts,
     poses: FloatArray,

@@ -3,7 +3,8 @@
 For each keyframe: its place is predicted from the last and the odometry between; earlier passes over that ground are
 searched (`closure_search`); what passes every check waits until another closure of the last keyframes agrees with
 it; then both enter the graph. After optimising, closures that the graph contradicts are taken back, and those that
-it no longer contradicts return.
+it no longer contradicts return. Closures that agree with the present estimate move its last keyframes only; what the
+map keeps is bounded (`bounded_map`).
 
 Sources: Mangelson et al., "Pairwise consistent measurement set maximization" (ICRA 2018) for agreement; Latif et
 al., "Robust loop closing over time" (IJRR 2013) for taking closures back.
@@ -16,16 +17,21 @@ from numpy.typing import NDArray
 
 from robominer_slam import geometry
 from robominer_slam.configuration.robust_slam_section import RobustSlamSection
+from robominer_slam.slam.bounded_map import BoundedMap
+from robominer_slam.slam.closure_counters import ClosureCounters
 from robominer_slam.slam.closure_search import Closure, ClosureSearch, Patch
 from robominer_slam.slam.composite_scan import voxel_filter
-from robominer_slam.slam.keyframe import BackendResult, GraphEdge, Keyframe
-from robominer_slam.slam.keyframe_graph import KeyframeGraph, LevelEdge
+from robominer_slam.slam.graph_marginals import TrackedCovariance
+from robominer_slam.slam.keyframe import BackendResult, Keyframe
+from robominer_slam.slam.keyframe_graph import KeyframeGraph
+from robominer_slam.slam.level_edges import LevelEdge
+from robominer_slam.slam.patch_memory import PatchMemory, PatchPages
+from robominer_slam.slam.published_edges import PLANAR, PublishedEdges
 from robominer_slam.slam.surface import SurfaceModel
 from robominer_slam.slam.surface_registration import placed
 
 FloatArray = NDArray[np.float64]
 
-PLANAR = [0, 1, 5]
 #: A patch of fewer touches is too small to be told from others.
 LEAST_POINTS = 60
 #: Least variance of an odometry edge in x, y (m2) and heading (rad2): a keyframe's instant is known to 5 ms or so.
@@ -33,39 +39,54 @@ EDGE_FLOOR = np.square([0.001, 0.001, 0.001])
 #: Deviation of the height from one keyframe to the next, m, where the odometry does not say.
 HEIGHT_WALK = 0.002
 HEIGHT_SIGMA = 0.003
-TILT_SIGMA = 0.005
 #: A patch as a whole is about its middle: of the drift from its oldest to its newest keyframe it has half.
 PATCH_SHARE = 0.5
 
 
 class RobustBackend:
-    """Takes keyframes one after the other; deterministic."""
+    """Takes keyframes one after the other; deterministic. Use, and `release`, in one thread.
 
-    def __init__(self, parameters: RobustSlamSection) -> None:
+    Args:
+        parameters: with units and reasons there.
+        pages: where touches go that do not fit into memory; None keeps all there.
+
+    Attributes:
+        closures: counts of the closures found, and the last of them.
+    """
+
+    def __init__(self, parameters: RobustSlamSection, pages: PatchPages | None = None) -> None:
         self._parameters = parameters
+        bounds = parameters.bounds
         s = parameters.surface
         self._search = ClosureSearch(
             parameters.closure, SurfaceModel(s.touch_sigma, s.curvature, s.slope_sigma, s.reach)
         )
         self._graph = KeyframeGraph()
-        self._patches: dict[int, Patch] = {}
-        self._tilts: dict[int, FloatArray] = {}
+        self._patches = PatchMemory(bounds.max_points_in_memory, pages)
+        self._map = BoundedMap(bounds, self._graph, self._patches)
+        self._tracked = TrackedCovariance(self._graph, bounds.refresh)
+        self._published = PublishedEdges()
+        self._since_full = 0
+        self._searched = self._closed = -1
         self._pending: list[Closure] = []
         self._recent: list[Closure] = []
         self._last: Keyframe | None = None
         self._covariance = np.zeros((3, 3))
         self._version = 0
-        self.log: list[Closure] = []
+        self.closures = ClosureCounters()
 
     def process(self, keyframe: Keyframe) -> BackendResult:
         """Add a keyframe, search for loop closures, optimise."""
+        self._map.begin(keyframe.id, keyframe.floor is None or bool(keyframe.floor.all()))
         self._add_node(keyframe)
-        accepted = self._agreed(self._found(keyframe)) if self._parameters.closure.enabled else []
+        accepted = self._agreed(self._found(keyframe)) if self._is_searched(keyframe.id) else []
         for closure in accepted:
             self._add_loop(closure)
         if accepted:
-            self._optimise()
-        self._update_covariance(keyframe.id)
+            self._optimise(accepted)
+        self._bound(keyframe.id)
+        if self._last is not None:
+            self._covariance = self._tracked.of_newest()
         self._last = keyframe
         self._version += 1
         return self._result(keyframe, len(accepted))
@@ -77,10 +98,9 @@ class RobustBackend:
         points = voxel_filter(keyframe.floor_points @ tilt.T, self._parameters.point_voxel)
         k = keyframe.id
         self._patches[k] = Patch(points, keyframe.travelled)
-        self._tilts[k] = tilt
         graph = self._graph
         if self._last is None:
-            graph.poses[k], graph.heights[k] = level[:3], float(level[3])
+            graph.nodes.append(k, level[:3], float(level[3]), tilt, keyframe.travelled)
             return
         last, _ = levelled(self._last.T_odom_base)
         Z = geometry.se2_compose(geometry.se2_inverse(last[:3]), level[:3])
@@ -106,14 +126,17 @@ class RobustBackend:
             motion.bias[:nb],
         )
         graph.edges.append(edge)
+        if len(graph.nodes) <= self._parameters.bounds.local_window:
+            self._tracked.forget()
         posterior = motion.bias_posterior[:nb]
         # What the loops have taught of the biases stays; what the odometry has learned since is added.
         graph.bias = graph.bias + (posterior - graph.bias_prior) if graph.bias.size == nb else posterior.copy()
         graph.bias_prior = posterior
         graph.bias_prior_information = _inverse(motion.bias_covariance[:nb, :nb] + 1e-14 * np.eye(nb))
         step = geometry.se2_exp(edge.jacobian @ (graph.bias - edge.reference))
-        graph.poses[k] = geometry.se2_compose(graph.poses[self._last.id], geometry.se2_compose(Z, step))
-        graph.heights[k] = graph.heights[self._last.id] + dz
+        pose = geometry.se2_compose(graph.nodes[self._last.id], geometry.se2_compose(Z, step))
+        graph.nodes.append(k, pose, graph.nodes.height(self._last.id) + dz, tilt, keyframe.travelled)
+        self._tracked.follow(edge, graph.bias)
 
     def _source(self, keyframe: Keyframe) -> tuple[FloatArray, int]:
         """Touches of the last keyframes, in the level frame of the newest, and the id of the oldest."""
@@ -123,50 +146,79 @@ class RobustBackend:
             if patch is None or keyframe.travelled - patch.travelled >= self._parameters.closure.patch:
                 break
             pose = self._graph.relative(keyframe.id, k)
-            dz = self._graph.heights[k] - self._graph.heights[keyframe.id]
+            dz = self._graph.nodes.height(k) - self._graph.nodes.height(keyframe.id)
             parts.append(placed(patch.points, np.append(pose, dz)))
             oldest = k
         return np.concatenate(parts), oldest
 
     # --------------------------------------------------------------------------------------------- closures
 
+    def _is_searched(self, key: int) -> bool:
+        """Whether closures are searched at all, and this keyframe's turn has come."""
+        if not self._parameters.closure.enabled:
+            return False
+        return key - self._searched >= self._parameters.bounds.sure_spacing or not self._is_sure(key)
+
+    def _is_sure(self, key: int) -> bool:
+        """Whether one closure now and then will do: the graph is large, and a closure has just held it here."""
+        bounds = self._parameters.bounds
+        return len(self._graph.nodes) > bounds.small_map and key - self._closed <= bounds.sure_span
+
+    def _chosen(self, key: int, passes: list[list[int]]) -> list[list[int]]:
+        """Passes to match with: all in a small map; else one, the nearest or, where that may not do, each in turn."""
+        if len(self._graph.nodes) <= self._parameters.bounds.small_map or len(passes) < 2:
+            return passes
+        return passes[:1] if self._is_sure(key) else [passes[key % len(passes)]]
+
     def _found(self, keyframe: Keyframe) -> list[Closure]:
         """Closures of a keyframe that pass every check of their own."""
+        self._searched = keyframe.id
         source, oldest = self._source(keyframe)
         if len(source) < LEAST_POINTS:
             return []
-        k, graph = keyframe.id, self._graph
+        k, graph, nodes = keyframe.id, self._graph, self._graph.nodes
         sigma = float(np.sqrt(np.linalg.eigvalsh(self._predicted_covariance()[:2, :2])[-1]))
         reach = self._parameters.closure.sigmas * sigma
         found = []
-        for ids in self._search.passes(k, self._patches, graph.poses, reach):
+        for ids in self._chosen(k, self._search.passes(k, self._outlines(reach), nodes, reach)):
             anchor = min(ids, key=lambda i: float(np.hypot(*graph.relative(i, k)[:2])))
-            covariance = graph.relative_covariance(anchor, k)
+            covariance = self._tracked.relative(anchor)
             closure = self._search.find(
                 source,
                 k,
                 ids,
                 self._patches,
-                graph.poses,
-                graph.heights[k] - graph.heights[anchor],
+                nodes,
+                nodes.height(k) - nodes.height(anchor),
                 graph.relative(anchor, k),
                 covariance,
-                PATCH_SHARE * self._between(oldest, k),
+                PATCH_SHARE * graph.odometry_between(oldest, k),
                 anchor,
             )
             if closure is not None:
-                self.log.append(closure)
+                self.closures.found(closure, self._parameters.closure)
                 if closure.good:
                     found.append(closure)
         return found
 
+    def _outlines(self, reach: float) -> dict[int, Patch]:
+        """Ways, without the touches, of the keyframes that `passes` may choose from, and of the newest."""
+        p, nodes = self._parameters.closure, self._graph.nodes
+        near = nodes.mapped & (nodes.travelled <= nodes.travelled[-1] - p.min_travel)
+        near &= np.hypot(*(nodes.poses[:, :2] - nodes.poses[-1, :2]).T) <= p.target_radius + reach
+        near[-1] = True
+        nothing = np.zeros((0, 3))
+        return {
+            int(k): Patch(nothing, float(way)) for k, way in zip(nodes.ids[near], nodes.travelled[near], strict=True)
+        }
+
     def _predicted_covariance(self) -> FloatArray:
         """Of the newest keyframe in its own frame: the last one's, grown by the odometry since."""
-        edge = self._graph.edges[-1] if self._graph.edges else None
-        if edge is None:
+        edges = self._graph.edges
+        if not len(edges):
             return self._covariance
-        Ad = geometry.se2_adjoint(geometry.se2_inverse(edge.Z))
-        grown: FloatArray = Ad @ self._covariance @ Ad.T + _inverse(edge.information)
+        Ad = geometry.se2_adjoint(geometry.se2_inverse(edges.Z[-1]))
+        grown: FloatArray = Ad @ self._covariance @ Ad.T + edges.covariance[-1]
         return grown
 
     def _agreed(self, found: list[Closure]) -> list[Closure]:
@@ -197,17 +249,10 @@ class RobustBackend:
         way = geometry.se2_compose(geometry.se2_compose(graph.relative(b.i, a.i), a.Z), graph.relative(a.j, b.j))
         error = geometry.se2_log(geometry.se2_compose(geometry.se2_inverse(way), b.Z))
         Ad = geometry.se2_adjoint(graph.relative(b.j, a.j))
-        covariance = Ad @ a.covariance @ Ad.T + b.covariance + self._between(a.j, b.j)
+        covariance = Ad @ a.covariance @ Ad.T + b.covariance + graph.odometry_between(a.j, b.j)
         if a.i != b.i:
-            covariance = covariance + self._between(a.i, b.i)
+            covariance = covariance + graph.odometry_between(a.i, b.i)
         return float(error @ np.linalg.solve(covariance, error)) <= self._parameters.closure.agreement
-
-    def _between(self, a: int, b: int) -> FloatArray:
-        """Covariance of the odometry between two keyframes, summed along the way; as of steps, arms left out."""
-        low, high = min(a, b), max(a, b)
-        steps = [e for e in self._graph.edges if e.kind == "odometry" and low < e.j <= high]
-        total: FloatArray = sum((_inverse(e.information) for e in steps), np.zeros((3, 3)))
-        return total
 
     def _add_loop(self, closure: Closure) -> None:
         nb = self._graph.bias.size
@@ -228,66 +273,94 @@ class RobustBackend:
 
     # -------------------------------------------------------------------------------------------- optimising
 
-    def _optimise(self) -> None:
+    def _optimise(self, accepted: list[Closure]) -> None:
+        """Optimise as much of the graph as the new closures ask for."""
+        bounds, graph = self._parameters.bounds, self._graph
+        self.closures.counts["accepted"] += len(accepted)
+        self._closed = max(closure.j for closure in accepted)
+        self._since_full += 1
+        large = self._since_full >= bounds.full_every or any(self._is_far(closure) for closure in accepted)
+        if not large and len(graph.nodes) > bounds.local_window:
+            graph.optimise_window(bounds.local_window)
+            edges = graph.edges
+            contradicted = edges.loop & edges.enabled & (edges.chi2 > self._parameters.closure.take_back)
+            if not contradicted.any():
+                self._tracked.closed(len(accepted), self._parameters.closure.max_sigma)
+                return
+        self._since_full = 0
+        self._optimise_whole()
+        self._tracked.forget()
+
+    def _is_far(self, closure: Closure) -> bool:
+        """Whether a closure moves its keyframe by more than the last keyframes can take."""
+        bounds = self._parameters.bounds
+        off = geometry.se2_compose(geometry.se2_inverse(self._graph.relative(closure.i, closure.j)), closure.Z)
+        moved, turned = float(np.hypot(off[0], off[1])), abs(float(off[2]))
+        return moved > bounds.local_distance or turned > np.deg2rad(bounds.local_angle_deg)
+
+    def _optimise_whole(self) -> None:
         """Optimise; take back what the optimum contradicts, let return what it no longer does; until that settles."""
-        limit = self._parameters.closure.take_back
+        limit, edges = self._parameters.closure.take_back, self._graph.edges
         for _ in range(4):
             self._graph.optimise()
-            loops = [e for e in self._graph.edges if e.kind == "loop"]
-            worst = max((e for e in loops if e.enabled), key=lambda e: e.chi2, default=None)
-            changed = False
-            if worst is not None and worst.chi2 > limit:
-                for edge in loops:
-                    if edge.enabled and edge.chi2 > max(limit, 0.5 * worst.chi2):
-                        edge.enabled, changed = False, True
+            on = edges.loop & edges.enabled
+            worst = float(edges.chi2[on].max(initial=0.0))
+            if worst > limit:
+                switched, back = on & (edges.chi2 > max(limit, 0.5 * worst)), False
             else:
-                for edge in loops:
-                    if not edge.enabled and edge.chi2 <= 0.5 * limit:
-                        edge.enabled, changed = True, True
-            if not changed:
+                switched, back = edges.loop & ~edges.enabled & (edges.chi2 <= 0.5 * limit), True
+            if not switched.any():
                 return
+            self.closures.counts["returned" if back else "taken_back"] += int(switched.sum())
+            edges.switch(switched, back)
         self._graph.optimise()
 
-    def _update_covariance(self, k: int) -> None:
-        if self._last is None:
-            return
-        self._covariance = self._graph.covariance([k])
+    # ------------------------------------------------------------------------------------------------ bounds
+
+    def _bound(self, newest: int) -> None:
+        """Let go of touches and keyframes that are too many."""
+        p = self._parameters.closure
+        self._map.settle(newest, p.patch, p.partner_span, p.min_travel)
+        if self._map.shrink():
+            nodes = self._graph.nodes
+            self._pending = [c for c in self._pending if c.i in nodes and c.j in nodes]
+            self._recent = [c for c in self._recent if c.i in nodes and c.j in nodes]
+            self._tracked.forget()
+
+    def release(self) -> None:
+        """Let go of what must be freed in the thread that made it."""
+        self._tracked.forget()
 
     # ------------------------------------------------------------------------------------------------ result
 
     def _result(self, keyframe: Keyframe, closures: int) -> BackendResult:
-        graph = self._graph
-        ids = sorted(graph.poses)
-        poses = np.array([self._pose(k) for k in ids])
-        pose = poses[-1]
-        yaw = graph.poses[keyframe.id][2]
+        nodes = self._graph.nodes
+        poses = geometry.T_from_xyyaw(nodes.poses)
+        poses[:, 2, 3] = nodes.heights
+        poses[:, :3, :3] = poses[:, :3, :3] @ nodes.tilts
+        yaw = nodes.poses[-1, 2]
         c, s = np.cos(yaw), np.sin(yaw)
         R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        self._published.follow(self._graph.edges, nodes)
         return BackendResult(
             keyframe=keyframe,
-            T_map_odom=geometry.normalise_pose(pose @ geometry.inverse(keyframe.T_odom_base)),
+            T_map_odom=geometry.normalise_pose(poses[-1] @ geometry.inverse(keyframe.T_odom_base)),
             poses=poses,
             covariance=R @ self._covariance @ R.T,
-            edges=tuple(self._published(e) for e in graph.edges),
+            edges=tuple(self._published.edges),
             closures=closures,
             version=self._version,
+            ids=tuple(nodes.ids.tolist()),
+            added=tuple(self._published.added),
+            removed=tuple(self._map.removed),
+            merged=tuple(self._map.merged),
+            bare=tuple(self._map.bare),
+            counts={
+                **{f"closures.{name}": count for name, count in self.closures.counts.items()},
+                "points.in_memory": self._patches.points_in_memory,
+                "points.fetched": self._patches.fetched,
+            },
         )
-
-    def _pose(self, k: int) -> FloatArray:
-        T = geometry.T_from_xyyaw(self._graph.poses[k])
-        T[2, 3] = self._graph.heights[k]
-        T[:3, :3] = T[:3, :3] @ self._tilts[k]
-        return T
-
-    def _published(self, edge: LevelEdge) -> GraphEdge:
-        T = geometry.T_from_xyyaw(edge.Z)
-        T[2, 3] = edge.dz
-        # From level frames to the keyframes' own.
-        R_i, R_j = np.eye(4), np.eye(4)
-        R_i[:3, :3], R_j[:3, :3] = self._tilts[edge.i], self._tilts[edge.j]
-        information = np.diag([0.0, 0.0, edge.dz_information, TILT_SIGMA**-2, TILT_SIGMA**-2, 0.0])
-        information[np.ix_(PLANAR, PLANAR)] = edge.information
-        return GraphEdge(edge.kind, edge.i, edge.j, R_i.T @ T @ R_j, information, 1.0 if edge.enabled else 0.0)
 
 
 def levelled(T: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from robominer_slam import geometry
 from robominer_slam.slam.closure_search import Closure, Patch
 from robominer_slam.slam.keyframe import BackendResult, Keyframe
-from robominer_slam.slam.keyframe_graph import LevelEdge
+from robominer_slam.slam.level_edges import LevelEdge
 from robominer_slam.slam.level_map import LevelMap
 from robominer_slam.slam.robust import RobustBackend
 from robominer_slam.slam.surface import Surface, SurfaceModel
@@ -26,22 +26,34 @@ LOOK_POINTS = 200
 
 
 class SessionBackend(RobustBackend):
-    """The method's back-end, from an empty graph on."""
+    """The method's back-end, from an empty graph on.
+
+    Attributes:
+        bounded: whether keyframes and touches may go; not while it is in doubt which of them are the map's.
+    """
+
+    bounded = True
 
     @property
     def ids(self) -> tuple[int, ...]:
         """Of all keyframes in the graph."""
-        return tuple(sorted(self._graph.poses))
+        return tuple(self._graph.nodes.ids.tolist())
 
     def pose(self, k: int) -> FloatArray:
         """x, y, heading, z of a keyframe, shape (4,), m and rad."""
-        return np.append(self._graph.poses[k], self._graph.heights[k])
+        return np.append(self._graph.nodes[k], self._graph.nodes.height(k))
 
     def level_map(self) -> LevelMap:
-        """The graph as a known map."""
-        graph = self._graph
+        """The graph as a known map; all its touches come into memory."""
+        nodes, edges = self._graph.nodes, self._graph.edges
+        ids = nodes.ids.tolist()
         return LevelMap(
-            dict(graph.poses), dict(graph.heights), dict(self._tilts), dict(self._patches), list(graph.edges)
+            dict(zip(ids, nodes.poses.copy(), strict=True)),
+            dict(zip(ids, nodes.heights.tolist(), strict=True)),
+            dict(zip(ids, nodes.tilts.copy(), strict=True)),
+            dict(zip(ids, nodes.travelled.tolist(), strict=True)),
+            {k: self._patches[k] for k in ids if k in self._patches},
+            [edges.edge(row) for row in range(len(edges))],
         )
 
     def adopt(self, known: LevelMap, origin: FloatArray, ties: Sequence[Closure]) -> None:
@@ -52,25 +64,32 @@ class SessionBackend(RobustBackend):
             origin: of the session's frame in map, x, y, heading, z, shape (4,).
             ties: closures from the session's keyframes to the map's.
         """
-        graph = self._graph
-        for k in graph.poses:
-            graph.poses[k] = geometry.se2_compose(origin[:3], graph.poses[k])
-            graph.heights[k] += float(origin[3])
-        begin = min((p.travelled for p in self._patches.values()), default=0.0)
-        end = max((p.travelled for p in known.patches.values()), default=0.0)
-        shift = begin - FAR - end
-        graph.poses.update(known.poses)
-        graph.heights.update(known.heights)
-        self._tilts.update(known.tilts)
-        self._patches.update({k: Patch(p.points, p.travelled + shift) for k, p in known.patches.items()})
+        graph, nodes = self._graph, self._graph.nodes
+        nodes.poses[:] = geometry.se2_compose(origin[:3], nodes.poses)
+        nodes.heights[:] += float(origin[3])
+        begin = float(nodes.travelled[0]) if len(nodes) else 0.0
+        shift = begin - FAR - max(known.travelled.values(), default=0.0)
+        nodes.put_before(known.nodes(shift))
+        for k, patch in known.patches.items():
+            self._patches[k] = Patch(patch.points, patch.travelled + shift)
         nb = graph.bias.size
-        graph.edges[:0] = [_with_biases(edge, nb) for edge in known.edges]
+        for edge in known.edges:
+            graph.edges.append(_with_biases(edge, nb))
         for tie in ties:
             self._add_loop(tie)
+        self.closures.counts["accepted"] += len(ties)
+        self._closed = max((tie.j for tie in ties), default=self._closed)
         self._recent = list(ties)
-        self._optimise()
+        self._map.joined(self._parameters.keyframe_distance)
+        self._since_full = 0
+        self._optimise_whole()
+        self._tracked.forget()
         if self._last is not None:
-            self._update_covariance(self._last.id)
+            self._covariance = self._tracked.of_newest()
+
+    def _bound(self, newest: int) -> None:
+        if self.bounded:
+            super()._bound(newest)
 
     def present(self, keyframe: Keyframe, closures: int) -> BackendResult:
         """The result as it is now, of the newest keyframe."""
@@ -86,14 +105,16 @@ class SessionBackend(RobustBackend):
             model: how touches make a surface.
             recent: ids of keyframes whose ground does not count; None for those of the closures' least travel.
         """
-        graph, p = self._graph, self._parameters.closure
+        nodes, p = self._graph.nodes, self._parameters.closure
         k = keyframe.id
         points = self._patches[k].points
-        old = [
-            i for i, patch in self._patches.items()
-            if (patch.travelled <= keyframe.travelled - p.min_travel if recent is None else i not in recent)
-            and np.hypot(*(graph.poses[i][:2] - graph.poses[k][:2])) <= p.target_radius
-        ]  # fmt: skip
+        near = nodes.mapped & (np.hypot(*(nodes.poses[:, :2] - nodes[k][:2]).T) <= p.target_radius)
+        near &= (
+            nodes.travelled <= keyframe.travelled - p.min_travel
+            if recent is None
+            else ~np.isin(nodes.ids, np.fromiter(recent, dtype=np.int64))
+        )
+        old = nodes.ids[near].tolist()
         if not old or len(points) < LOOK_POINTS // 4:
             return None
         ground = np.concatenate([placed(self._patches[i].points, self.pose(i)) for i in old])
