@@ -25,7 +25,8 @@ from robominer_slam.rest_tracking import RestTracker
 from robominer_slam.slam.backend_runner import BackendRunner, SynchronousRunner, ThreadedRunner
 from robominer_slam.slam.composite_scan import CompositeScan
 from robominer_slam.slam.keyframe import Backend
-from robominer_slam.slam.robust import RobustBackend
+from robominer_slam.slam.localised_backend import LocalisedBackend
+from robominer_slam.slam.saved_map import SavedMap
 from robominer_slam.slam.scan_odometry import ScanOdometry
 from robominer_slam.slam.surface import SurfaceModel
 from robominer_slam.slam.thesis import ThesisBackend
@@ -37,12 +38,16 @@ Execution = Literal["synchronous", "threaded"]
 
 
 def build_pipeline(
-    configuration: Configuration, layout: WhiskerLayout, model: PolynomialModel, execution: Execution
+    configuration: Configuration,
+    layout: WhiskerLayout,
+    model: PolynomialModel,
+    execution: Execution,
+    known: SavedMap | None = None,
 ) -> Pipeline:
-    """Assemble the pipeline; `threaded` for the daemon, `synchronous` for replay."""
-    composite, runner = build_slam(configuration, execution)
+    """Assemble the pipeline; `threaded` for the daemon, `synchronous` for replay; in a known map, if there is one."""
+    composite, runner = build_slam(configuration, execution, known)
     contact = configuration.contact
-    return Pipeline(
+    pipeline = Pipeline(
         dead_reckoning=_dead_reckoning(configuration, layout),
         angle_estimator=AngleEstimator(model),
         monitor=WhiskerMonitor(
@@ -64,10 +69,14 @@ def build_pipeline(
         },
         reorder_window_ns=round(configuration.estimation.reorder_window * 1e9),
     )
+    pipeline.localised = known is None
+    return pipeline
 
 
-def build_slam(configuration: Configuration, execution: Execution) -> tuple[CompositeScan | None, BackendRunner | None]:
-    """The method's front-end and back-end, fresh; nothing for odometry alone."""
+def build_slam(
+    configuration: Configuration, execution: Execution, known: SavedMap | None = None
+) -> tuple[CompositeScan | None, BackendRunner | None]:
+    """The method's front-end and back-end, fresh or in a known map; nothing for odometry alone."""
     slam = configuration.slam
     backend: Backend
     match slam.method:
@@ -78,8 +87,9 @@ def build_slam(configuration: Configuration, execution: Execution) -> tuple[Comp
             composite = CompositeScan(thesis.keyframe_distance, thesis.keyframe_angle, thesis.scan_voxel)
             backend = ThesisBackend(thesis)
         case "robust":
-            composite = CompositeScan(slam.robust.keyframe_distance, slam.robust.keyframe_angle, 0.0)
-            backend = RobustBackend(slam.robust)
+            first = known.next_id if known is not None else 0
+            composite = CompositeScan(slam.robust.keyframe_distance, slam.robust.keyframe_angle, 0.0, first)
+            backend = LocalisedBackend(slam.robust, known, frozen=known is not None and slam.start == "localize")
     latency_ns = round(slam.backend_latency * 1e9)
     if execution == "threaded":
         return composite, ThreadedRunner(backend, latency_ns, slam.backend_queue)

@@ -26,6 +26,7 @@ from robominer_slam.publishing.bus_messages import Query, Reply
 from robominer_slam.publishing.report_messages import Diagnostic
 from robominer_slam.publishing.telemetry import Health
 from robominer_slam.publishing.zenoh_session import ZenohBus
+from robominer_slam.slam.saved_map import SavedMap
 from robominer_slam.sources.source import MeasurementSource
 from robominer_slam.store import MapStore
 from robominer_slam.telemetry_frame import telemetry
@@ -51,6 +52,7 @@ class Daemon:
         source: MeasurementSource,
         bus: ZenohBus,
         store: MapStore,
+        known: SavedMap | None = None,
     ) -> None:
         self._configuration = configuration
         self._layout = array.layout
@@ -60,15 +62,20 @@ class Daemon:
         self._lock = threading.Lock()
         self._clock = WallClock()
         self._carries = {one.name: one.carries for one in device_settings(configuration)}
-        self._pipeline = build_pipeline(configuration, array.layout, array.model, "threaded")
+        self._pipeline = build_pipeline(configuration, array.layout, array.model, "threaded", known)
         self._map = KeyframeMap(configuration.map.point_voxel)
         section = configuration.map
         self._publisher = Publisher(bus, self._clock, array.layout)
         self._map_service = MapService(bus, self._clock, self._map, section.grid_cell, section.obstacle_height)
-        self._commands = Commands(self._pipeline, self._map, store, self._new_map)
+        slam = configuration.slam
+        relocalisation = slam.robust.relocalisation if slam.method == "robust" else None
+        self._commands = Commands(self._pipeline, self._map, store, self._new_map, relocalisation)
         self._last_frame: FrameResult | None = None
         self._telemetry_ns = self._status_ns = self._telemetry_count = 0
         self._declare_queries()
+        if known is not None:
+            self._map_service.load(known)
+            log.info("map %s with %d keyframes: looking for the place in it", known.name, len(known.keyframes))
 
     def run(self, stop: threading.Event) -> None:
         """Work until `stop` is set; then finish what was begun and keep it.
@@ -151,7 +158,7 @@ class Daemon:
                     self._map.take(result)
                     self._store.add(result, self._clock.offset_ns)
         if self._store.flush(10.0):
-            self._store.save_poses(self._map.poses)
+            self._store.save_poses(self._map.poses, self._map.ids, self._map.edges)
         log.info(
             "ended after %d frames: %d keyframes, %d loop closures, %d keyframes stored",
             self._publisher.frames, len(self._map.keyframes), self._map.closures, self._store.written,

@@ -16,6 +16,7 @@ from robominer_slam.publishing import cloud_messages, pose_messages, report_mess
 from robominer_slam.publishing.bus_messages import QueryRefusedError, Reply
 from robominer_slam.publishing.map_stream import MapStreamEncoder
 from robominer_slam.publishing.zenoh_session import ZenohBus
+from robominer_slam.slam.saved_map import SavedMap
 from robominer_slam.wall_clock import WallClock
 
 PATH_INTERVAL_NS = 1_000_000_000
@@ -61,6 +62,11 @@ class MapService:
         poses = geometry.to_vector7(whole.poses)
         for message in self._stream.update(whole.version, whole.keyframes, poses, self._clock.offset_ns):
             self._bus.put("map/updates", message)
+
+    def load(self, known: SavedMap) -> None:
+        """Start with a map that was saved."""
+        self.keyframe_map.load(known)
+        self._publish_updates()
 
     def new_map(self) -> None:
         """Start anew with an empty map, under another id."""

@@ -28,6 +28,7 @@ from robominer_slam.reorder import ReorderBuffer
 from robominer_slam.slam.backend_runner import BackendRunner
 from robominer_slam.slam.composite_scan import CompositeScan
 from robominer_slam.slam.keyframe import BackendResult, Keyframe
+from robominer_slam.slam.place_prior import PlacePrior
 from robominer_slam.slam.robust import levelled
 from robominer_slam.slam.scan_odometry import ScanOdometry
 from robominer_slam.whisker_monitor import WhiskerMonitor
@@ -40,6 +41,8 @@ BLIND_NS = 2_000_000_000
 HEIGHT_SIGMA_M = 0.002
 #: Without odometry for this long the robot may be anywhere near: the pose is not known.
 ODOMETRY_TIMEOUT_NS = 2_000_000_000
+#: Of x, y, yaw while the place in the map is not known: 10 m, and any heading.
+UNKNOWN_COVARIANCE = np.diag([100.0, 100.0, 10.0])
 
 
 class Pipeline:
@@ -84,6 +87,10 @@ class Pipeline:
         self._imu_mounts = imu_mounts
         self._scan_odometry = scan_odometry
         self._points_down = np.ones(angle_estimator.count, dtype=np.bool_) if points_down is None else points_down
+        self.localised = True
+        self._prior: PlacePrior | None = None
+        self._sought_from = -1
+        self._breaks = 0
         self._T_map_odom = np.eye(4)
         self._last_result: BackendResult | None = None
         self._odometry_at_result: FloatArray | None = None
@@ -116,6 +123,15 @@ class Pipeline:
         T_odom_base = planar_pose(self._dead_reckoning.state_at(stamp))
         self._T_map_odom = geometry.T_from_xyyaw([x, y, yaw]) @ geometry.inverse(T_odom_base)
 
+    def localize_by_touch(self, prior: PlacePrior) -> None:
+        """Look for the place in the map from now on, near the prior first; it counts once touches confirm it."""
+        self.localize(prior.x, prior.y, prior.yaw)
+        self.localised, self._prior = False, prior
+        if self._composite is not None:
+            self._composite.restart()
+        if self._scan_odometry is not None:
+            self._scan_odometry.clear()
+
     def start_new_map(self, composite_scan: CompositeScan | None, runner: BackendRunner | None) -> None:
         """Begin anew with an empty map whose frame is odom; what the former back-end still computes is dropped."""
         if self.runner is not None:
@@ -124,6 +140,7 @@ class Pipeline:
         self._T_map_odom = np.eye(4)
         self._last_result = self._odometry_at_result = None
         self._odometry_of_keyframe.clear()
+        self.localised, self._prior, self._sought_from = True, None, -1
 
     def _process(self, due: list[tuple[str, Measurement]]) -> list[FrameResult]:
         results = []
@@ -180,7 +197,7 @@ class Pipeline:
             T_odom_base=T_odom_base,
             T_map_odom=self._T_map_odom,
             T_map_base=self._T_map_odom @ T_odom_base,
-            covariance=self._covariance(odometry),
+            covariance=self._covariance(odometry) if self.localised else UNKNOWN_COVARIANCE,
             angles=angles,
             whisker_states=self.monitor.health.states(),
             contacts=contacts,
@@ -204,8 +221,17 @@ class Pipeline:
             reckoning.correct_pose(stamp, correction.offset, correction.information)
             odometry = reckoning.state_at(stamp)
             level, _ = levelled(planar_pose(odometry))
+        if scans.breaks > self._breaks:
+            self._broken(scans.breaks)
         scans.add(level, points)
         return odometry
+
+    def _broken(self, breaks: int) -> None:
+        """The ground is not that of a moment ago: the place counts as unknown until the back-end has judged it."""
+        self._breaks = breaks
+        if self._composite is not None and self.runner is not None:
+            self._composite.restart()
+            self.localised, self._sought_from = False, self._composite.next_id
 
     def _keyframe(
         self,
@@ -221,6 +247,13 @@ class Pipeline:
         if keyframe is not None:
             if isinstance(self._dead_reckoning, TellsMotion):
                 keyframe = replace(keyframe, motion=self._dead_reckoning.mark_keyframe(stamp))
+            if self._scan_odometry is not None:
+                keyframe = replace(keyframe, breaks=self._scan_odometry.breaks)
+            if self._prior is not None:
+                # Told some way before the keyframe was complete.
+                x, y, yaw, _ = levelled(self._T_map_odom @ T_odom_base)[0].tolist()
+                keyframe = replace(keyframe, prior=replace(self._prior, x=x, y=y, yaw=yaw))
+                self._prior, self._sought_from = None, keyframe.id
             self._odometry_of_keyframe[keyframe.id] = odometry.covariance
             if keyframe.id == 0:
                 self._first_keyframe_covariance = odometry.covariance
@@ -228,9 +261,14 @@ class Pipeline:
         return keyframe
 
     def _take(self, result: BackendResult) -> None:
-        self._T_map_odom = result.T_map_odom
         self._last_result = result
         self._odometry_at_result = self._odometry_of_keyframe.pop(result.keyframe.id)
+        if self._prior is not None or result.keyframe.id < self._sought_from:
+            # Computed before the operator told the place.
+            return
+        self.localised = result.localised
+        if result.localised:
+            self._T_map_odom = result.T_map_odom
 
     def _covariance(self, odometry: OdometryState) -> FloatArray:
         """Covariance of (x, y, yaw) in map: the keyframe's, grown by odometry since.
@@ -252,6 +290,8 @@ class Pipeline:
             self._odometry_ns = stamp
         if stamp - self._odometry_ns > ODOMETRY_TIMEOUT_NS:
             return "lost"
+        if not self.localised:
+            return "relocalizing"
         if self.runner is None or self._contact_ns is None or stamp - self._contact_ns > BLIND_NS or self.paused:
             return "dead_reckoning"
         return "tracking"

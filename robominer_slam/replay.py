@@ -18,6 +18,8 @@ from robominer_slam.configuration.model import Configuration
 from robominer_slam.frame_result import FrameResult
 from robominer_slam.layout import WhiskerLayout, from_json
 from robominer_slam.mapping.keyframe_map import KeyframeMap
+from robominer_slam.slam.keyframe import BackendResult
+from robominer_slam.slam.saved_map import SavedMap
 
 FloatArray = NDArray[np.float64]
 
@@ -31,6 +33,7 @@ class ReplayResult:
 
     keyframe_map: KeyframeMap
     frames: int = 0
+    localised_frames: int = 0
     late: int = 0
     dropped: int = 0
     backend_s: float = 0.0
@@ -82,6 +85,8 @@ def replay(
     inputs: ReplayInputs,
     on_frame: Callable[[FrameResult], None],
     on_message: Callable[[int], None] = lambda _: None,
+    known: SavedMap | None = None,
+    on_rest: Callable[[BackendResult], None] = lambda _: None,
 ) -> ReplayResult:
     """Run a recording through the pipeline.
 
@@ -89,9 +94,13 @@ def replay(
         inputs: from `prepare`.
         on_frame: called with each frame's result.
         on_message: called with each measurement's log time, ns, for progress.
+        known: a saved map to start in, by the configuration's `slam.start`.
+        on_rest: called with the back-end's results that were not due at the last frame.
     """
-    pipeline = build_pipeline(inputs.configuration, inputs.layout, inputs.model, "synchronous")
+    pipeline = build_pipeline(inputs.configuration, inputs.layout, inputs.model, "synchronous", known)
     result = ReplayResult(KeyframeMap(inputs.configuration.map.point_voxel))
+    if known is not None:
+        result.keyframe_map.load(known)
 
     def frames() -> Iterator[FrameResult]:
         for log_time_ns, measurement in inputs.recording:
@@ -101,6 +110,7 @@ def replay(
         yield from pipeline.finish()
 
     for frame in frames():
+        result.localised_frames += frame.state == "tracking"
         for backend_result in frame.backend_results:
             result.keyframe_map.take(backend_result)
         result.frames += 1
@@ -108,6 +118,7 @@ def replay(
     if pipeline.runner is not None:
         for backend_result in pipeline.runner.close():
             result.keyframe_map.take(backend_result)
+            on_rest(backend_result)
         result.backend_s = pipeline.runner.busy_s
     result.late, result.dropped = pipeline.reorder.late, pipeline.reorder.dropped
     result.counters = dict(inputs.recording.counters)

@@ -17,6 +17,7 @@ from robominer_slam.publishing.zenoh_session import ZenohBus, ZenohSettings
 from robominer_slam.sources.source import MeasurementSource
 from robominer_slam.sources.zenoh_source import ZenohSource
 from robominer_slam.store import MapStore
+from robominer_slam.store_reader import map_to_start_in
 from robominer_slam.wall_clock import WallClock
 
 
@@ -43,11 +44,14 @@ def serve(configuration: Configuration, config_file: Path, stop: threading.Event
             forward(stack.enter_context(reader), bus, stop)
             return
         array = calibrated_array(configuration, folder)
-        store = MapStore(folder / configuration.store.path, configuration.store.sync_s, robot.id, "")
+        path = folder / configuration.store.path
+        map_id, known = map_to_start_in(configuration.slam, path, WallClock().offset_ns)
+        frozen = configuration.slam.start == "localize"
+        store = MapStore(path, configuration.store.sync_s, robot.id, "", map_id, frozen)
         bus = stack.enter_context(ZenohBus(settings, prefix))
         stack.enter_context(store)
         source: MeasurementSource = (
             ZenohSource(bus, WallClock()) if robot.role == "slam" else SerialReader(device_settings(configuration))
         )
         stack.enter_context(source)
-        Daemon(configuration, array, source, bus, store).run(stop)
+        Daemon(configuration, array, source, bus, store, known).run(stop)

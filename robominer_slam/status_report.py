@@ -65,6 +65,8 @@ def slam_diagnostic(
         return Diagnostic("localization", Level.STALE, f"no whisker frame for {frame_age_s:.1f} s", values)
     if frame.state == "lost":
         return Diagnostic("localization", Level.ERROR, "lost: no odometry for 2 s or more", values)
+    if frame.state == "relocalizing":
+        return Diagnostic("localization", Level.WARN, "looking for the place in the map: drive", values)
     return Diagnostic("localization", Level.OK, frame.state, values)
 
 

@@ -2,6 +2,8 @@
 
 Schema and tools are sqlite-utils' (imported only when a database is made); the rows of a drive are written with
 plain SQL, since sqlite-utils costs 5 ms a row. A batch is on the disk at most `sync_s` after its oldest keyframe.
+Poses that the back-end has moved since are written every few seconds, the weights of edges with them: a process
+that is killed loses no more than that.
 """
 
 from __future__ import annotations
@@ -12,6 +14,8 @@ import sqlite3
 import threading
 import time
 import zlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,12 +27,18 @@ from robominer_slam.slam.keyframe import BackendResult, GraphEdge
 log = logging.getLogger(__name__)
 
 FloatArray = NDArray[np.float64]
+#: Kind, i, j: an edge's name in its map.
+EdgeKey = tuple[str, int, int]
 
 SCHEMA_VERSION = 1
 QUEUE_LENGTH = 256
 #: Points are stored in millimetres: finer than the whiskers can tell.
 POINT_UNIT_M = 0.001
 UPPER = np.triu_indices(6)
+#: From one writing of corrected poses to the next, s: each costs a page per few keyframes.
+POSES_INTERVAL_S = 4.0
+#: Poses that moved less than this since they were written are not written again, m or (of the rotation) 1.
+POSE_TOLERANCE = 0.001
 
 
 class StoreError(ValueError):
@@ -104,6 +114,15 @@ def open_database(path: Path) -> sqlite3.Connection:
     return connection
 
 
+@dataclass(frozen=True, slots=True)
+class Item:
+    """What one result adds to the map: its keyframes are written with these edges; stamps get the offset, ns."""
+
+    result: BackendResult
+    edges: tuple[GraphEdge, ...]
+    clock_offset_ns: int
+
+
 class MapStore:
     """The thread `store`. Use as a context manager.
 
@@ -111,18 +130,28 @@ class MapStore:
         written: keyframes on the disk.
         fault: why nothing is being written now; empty if all is well.
         dropped: keyframes that could not be written because the disk has been failing for long.
+        frozen: whether the map must stay as it is: nothing is written then.
     """
 
-    def __init__(self, path: Path, sync_s: float, robot: str, name: str) -> None:
+    def __init__(
+        self, path: Path, sync_s: float, robot: str, name: str, map_id: int | None = None, frozen: bool = False
+    ) -> None:
+        """Open the database; keyframes go into a new map, or are added to that of `map_id`, which may be frozen."""
         self._connection = open_database(path)
         self._lock = threading.Lock()
         self._sync_s = sync_s
-        self._queue: queue.Queue[tuple[BackendResult, int] | None] = queue.Queue(QUEUE_LENGTH)
-        self.map_id = self._start_map(robot, name)
+        self._queue: queue.Queue[Item | None] = queue.Queue(QUEUE_LENGTH)
+        self.map_id = self._start_map(robot, name) if map_id is None else map_id
+        self._edges_seen = self._stored_edges() if map_id is not None else set()
+        self._moved: BackendResult | None = None
+        self._poses_written: dict[int, FloatArray] = {}
+        self._weights_written: dict[EdgeKey, float] = {}
+        self._poses_time = time.monotonic()
+        self.frozen = frozen
         self.written = 0
         self.dropped = 0
         self.fault = ""
-        self._failed: list[tuple[BackendResult, int]] = []
+        self._failed: list[Item] = []
         self._thread = threading.Thread(target=self._run, name="store", daemon=True)
 
     def __enter__(self) -> MapStore:
@@ -135,19 +164,50 @@ class MapStore:
         self._connection.close()
 
     def add(self, result: BackendResult, clock_offset_ns: int) -> None:
-        """Keep a result's keyframe and its new edges; never waits for the disk."""
+        """Keep a result's new keyframes and edges, and in time its poses; never waits for the disk."""
+        if self.frozen:
+            return
+        edges = tuple(e for e in result.edges if (e.kind, e.i, e.j) not in self._edges_seen)
         try:
-            self._queue.put_nowait((result, clock_offset_ns))
+            self._queue.put_nowait(Item(result, edges, clock_offset_ns))
         except queue.Full:
-            self.dropped += 1
+            self.dropped += len(result.new_keyframes)
+            return
+        self._edges_seen.update((e.kind, e.i, e.j) for e in edges)
 
-    def save_poses(self, poses: FloatArray) -> None:
-        """Write the poses, shape (n, 4, 4), that the back-end has corrected since the keyframes were stored."""
-        rows = [(_pack_pose(T), self.map_id, i) for i, T in enumerate(poses)]
+    def save_poses(self, poses: FloatArray, ids: Iterable[int] | None = None, edges: Sequence[GraphEdge] = ()) -> None:
+        """Write what the back-end has corrected since the keyframes were stored.
+
+        Args:
+            poses: of the keyframes, shape (n, 4, 4).
+            ids: of these keyframes; None for 0, 1, 2, ...
+            edges: of the graph, whose weights may have changed.
+        """
+        if self.frozen:
+            return
+        self._moved = None
+        self._update(poses, range(len(poses)) if ids is None else ids, edges)
+
+    def _update(self, poses: FloatArray, ids: Iterable[int], edges: Sequence[GraphEdge]) -> None:
+        places = dict(zip(ids, poses, strict=True))
+        moved = {k: T for k, T in places.items() if self._differs(k, T)}
+        weights: dict[EdgeKey, float] = {(e.kind, e.i, e.j): e.weight for e in edges}
+        weights = {key: w for key, w in weights.items() if self._weights_written.get(key) != w}
+        pose_rows = [(_pack_pose(T), self.map_id, k) for k, T in moved.items()]
+        weight_rows = [(w, self.map_id, *key) for key, w in weights.items()]
         with self._lock:
             self._connection.execute("BEGIN IMMEDIATE")
-            self._connection.executemany("UPDATE keyframes SET T_map_base = ? WHERE map_id = ? AND id = ?", rows)
+            self._connection.executemany("UPDATE keyframes SET T_map_base = ? WHERE map_id = ? AND id = ?", pose_rows)
+            self._connection.executemany(
+                "UPDATE edges SET weight = ? WHERE map_id = ? AND kind = ? AND i = ? AND j = ?", weight_rows
+            )
             self._connection.execute("COMMIT")
+        self._poses_written.update(moved)
+        self._weights_written.update(weights)
+
+    def _differs(self, k: int, T: FloatArray) -> bool:
+        written = self._poses_written.get(k)
+        return written is None or bool(np.abs(T - written).max() > POSE_TOLERANCE)
 
     def rename(self, name: str) -> None:
         """Name the current map."""
@@ -159,6 +219,15 @@ class MapStore:
         self.flush(self._sync_s * 2)
         with self._lock:
             self.map_id = self._start_map(robot, name)
+        self.frozen = False
+        self._edges_seen = set()
+        self._moved = None
+        self._poses_written, self._weights_written = {}, {}
+
+    @property
+    def waiting(self) -> int:
+        """Results that have not been written yet; beyond QUEUE_LENGTH they are dropped."""
+        return self._queue.qsize()
 
     def flush(self, timeout_s: float) -> bool:
         """Wait until what was added so far is on the disk; False if it took longer."""
@@ -174,6 +243,10 @@ class MapStore:
             "INSERT INTO maps (name, created_unix_ns, robot) VALUES (?, ?, ?)", (name, time.time_ns(), robot)
         )
         return int(cursor.lastrowid or 0)
+
+    def _stored_edges(self) -> set[EdgeKey]:
+        rows = self._connection.execute("SELECT kind, i, j FROM edges WHERE map_id = ?", (self.map_id,))
+        return {(str(kind), int(i), int(j)) for kind, i, j in rows}
 
     def _run(self) -> None:
         stopping = False
@@ -195,27 +268,52 @@ class MapStore:
                 else:
                     batch.append(item)
             self._write(self._failed + batch)
+            if batch:
+                self._moved = batch[-1].result
+            self._write_moved(stopping)
             for _ in range(taken):
                 self._queue.task_done()
 
-    def _write(self, batch: list[tuple[BackendResult, int]]) -> None:
+    def _write_moved(self, at_once: bool) -> None:
+        """Write corrected poses, if it is time."""
+        result = self._moved
+        now = time.monotonic()
+        if result is None or self.fault or (not at_once and now - self._poses_time < POSES_INTERVAL_S):
+            return
+        self._moved, self._poses_time = None, now
+        try:
+            self._update(result.poses, result.keyframe_ids, result.edges)
+        except sqlite3.Error as error:
+            if self._connection.in_transaction:
+                self._connection.execute("ROLLBACK")
+            log.warning("corrected poses cannot be stored now: %s", error)
+            self._moved = result
+
+    def _write(self, batch: list[Item]) -> None:
         if not batch:
             return
         keyframes, edges = [], []
-        for result, offset in batch:
-            keyframe = result.keyframe
-            T_map = result.poses[keyframe.id]
-            keyframes.append(
-                (
-                    self.map_id,
-                    keyframe.id,
-                    keyframe.stamp_ns + offset,
-                    _pack_pose(keyframe.T_odom_base),
-                    _pack_pose(T_map),
-                    pack_points(keyframe.points),
+        written: dict[int, FloatArray] = {}
+        count = 0
+        for item in batch:
+            place = {k: n for n, k in enumerate(item.result.keyframe_ids)}
+            for keyframe in item.result.new_keyframes:
+                T_map = item.result.poses[place[keyframe.id]]
+                written[keyframe.id] = T_map
+                keyframes.append(
+                    (
+                        self.map_id,
+                        keyframe.id,
+                        keyframe.stamp_ns + item.clock_offset_ns,
+                        _pack_pose(keyframe.T_odom_base),
+                        _pack_pose(T_map),
+                        pack_points(keyframe.points),
+                    )
                 )
-            )
-            edges += [_edge_row(self.map_id, edge) for edge in result.edges if edge.j == keyframe.id]
+                count += 1
+            edges += [_edge_row(self.map_id, edge) for edge in item.edges]
+        if not keyframes and not edges:
+            return
         try:
             with self._lock:
                 self._connection.execute("BEGIN IMMEDIATE")
@@ -234,7 +332,9 @@ class MapStore:
             return
         self._failed = []
         self.fault = ""
-        self.written += len(batch)
+        self.written += count
+        self._poses_written.update(written)
+        self._weights_written.update({(e[1], e[2], e[3]): e[6] for e in edges})
 
 
 def _pack_pose(T: FloatArray) -> bytes:

@@ -144,7 +144,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
                         ("pause", {"id": "1"}),
                         ("resume", {"id": "2"}),
                         ("save_map", {"name": "test", "id": "3"}),
-                        ("localize", {"x": "0", "y": "0", "yaw": "0"}),
+                        ("localize", {"x": "40", "y": "0", "yaw": "0"}),
                         ("dance", {}),
                     )
                 }

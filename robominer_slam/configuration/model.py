@@ -152,6 +152,10 @@ class SlamSection(Section):
     method: Literal["robust", "thesis", "none"] = parameter(
         "robust", "", "robust: this project's; thesis: its pipeline; none: odometry alone"
     )
+    start: Literal["new", "continue", "localize"] = parameter(
+        "new", "", "new: an empty map; continue: go on with a saved one; localize: follow the pose in it, unchanged"
+    )
+    map: str = parameter("", "", "name or id of the saved map; empty: the newest")
     backend_latency: float = parameter(
         0.5, "s", "a keyframe's result takes effect this long after it, in sensor time, so that replay equals run",
         low=0.0, high=60.0,

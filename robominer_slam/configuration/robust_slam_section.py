@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from robominer_slam.configuration.parameter import Section, parameter
+from robominer_slam.configuration.relocalisation_section import RelocalisationSection
 
 
 class SurfaceSection(Section):
@@ -108,3 +109,4 @@ class RobustSlamSection(Section):
     surface: SurfaceSection = Field(default_factory=SurfaceSection)
     scan_matching: ScanMatchingSection = Field(default_factory=ScanMatchingSection)
     closure: ClosureSection = Field(default_factory=ClosureSection)
+    relocalisation: RelocalisationSection = Field(default_factory=RelocalisationSection)

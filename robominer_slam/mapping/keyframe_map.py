@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from robominer_slam import geometry
 from robominer_slam.slam.composite_scan import voxel_filter
 from robominer_slam.slam.keyframe import BackendResult, GraphEdge, Keyframe
+from robominer_slam.slam.saved_map import SavedMap
 
 FloatArray = NDArray[np.float64]
 
@@ -41,14 +42,19 @@ class KeyframeMap:
         self.poses: FloatArray = np.zeros((0, 4, 4))
         self.edges: Sequence[GraphEdge] = ()
 
-    def take(self, result: BackendResult) -> MapKeyframe:
-        """Take a result of the back-end: a new keyframe, and poses for all."""
-        keyframe = self._thinned(result.keyframe)
-        self.keyframes.append(keyframe)
+    def take(self, result: BackendResult) -> None:
+        """Take a result of the back-end: new keyframes, and poses for all."""
+        self.keyframes += [self._thinned(keyframe) for keyframe in result.new_keyframes]
         self.poses = result.poses
         self.edges = result.edges
         self.version += 1
-        return keyframe
+
+    def load(self, saved: SavedMap) -> None:
+        """Start with a map that was saved."""
+        self.keyframes = [self._thinned(keyframe) for keyframe in saved.keyframes]
+        self.poses = saved.poses
+        self.edges = saved.edges
+        self.version += 1
 
     def clear(self) -> None:
         """Start anew; the version goes on, so that nobody takes the new map for the old one."""
@@ -56,6 +62,11 @@ class KeyframeMap:
         self.poses = np.zeros((0, 4, 4))
         self.edges = ()
         self.version += 1
+
+    @property
+    def ids(self) -> list[int]:
+        """Of the keyframes, in the order of the poses."""
+        return [keyframe.id for keyframe in self.keyframes]
 
     @property
     def closures(self) -> int:

@@ -33,9 +33,10 @@ class CompositeScan:
         distance: along odom's x or y, m.
         angle: of the heading, rad.
         scan_voxel: voxel filter of each scan, m; 0 for none.
+        first_id: of the first keyframe.
     """
 
-    def __init__(self, distance: float, angle: float, scan_voxel: float) -> None:
+    def __init__(self, distance: float, angle: float, scan_voxel: float, first_id: int = 0) -> None:
         self._distance = distance
         self._angle = angle
         self._voxel = scan_voxel
@@ -46,7 +47,7 @@ class CompositeScan:
         self._last: FloatArray | None = None
         self._added: FloatArray | None = None
         self._travelled = 0.0
-        self._next_id = 0
+        self._next_id = first_id
         self.dropped_points = 0
 
     def add(
@@ -90,6 +91,16 @@ class CompositeScan:
         keyframe = Keyframe(self._next_id, stamp_ns, T_odom_base, points_base, self._travelled, floor=floor_points)
         self._next_id += 1
         return keyframe
+
+    @property
+    def next_id(self) -> int:
+        """Of the next keyframe."""
+        return self._next_id
+
+    def restart(self) -> None:
+        """Forget the scans since the last keyframe: the robot has been carried."""
+        self._scans, self._floor, self._count = [], [], 0
+        self._start = self._added = None
 
     def _moved(self, T_odom_base: FloatArray) -> bool:
         if self._added is None:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robominer_slam.estimation.keyframe_motion import KeyframeMotion
+from robominer_slam.slam.place_prior import PlacePrior
 
 FloatArray = NDArray[np.float64]
 
@@ -26,6 +27,8 @@ class Keyframe:
         travelled: distance driven by odometry up to here, m.
         floor: which points are of whiskers that point down, shape (m,); None where all are or nobody asks.
         motion: since the keyframe before, where the dead reckoning tells its noise and biases apart.
+        breaks: how often so far the ground has ceased to be the one touched just before: carried, or fallen.
+        prior: where the operator says that this keyframe is; the way from the keyframe before is then not known.
     """
 
     id: int
@@ -35,6 +38,13 @@ class Keyframe:
     travelled: float
     motion: KeyframeMotion | None = None
     floor: NDArray[np.bool_] | None = None
+    breaks: int = 0
+    prior: PlacePrior | None = None
+
+    @property
+    def floor_points(self) -> FloatArray:
+        """The points of whiskers that point down: heights over the plane are the floor's, walls have none."""
+        return self.points if self.floor is None else self.points[self.floor]
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +78,10 @@ class BackendResult:
         edges: of the whole graph.
         closures: loop closures added by this keyframe.
         version: grows by one with each result.
+        entered: keyframes that are new in the map; None for just `keyframe`. While the place in the map is not
+            known there are none, and all that were made meanwhile enter together when it is.
+        ids: of the keyframes that `poses` are of; None for 0, 1, 2, ...
+        localised: whether the keyframe's place in the map is known.
     """
 
     keyframe: Keyframe
@@ -77,6 +91,19 @@ class BackendResult:
     edges: Sequence[GraphEdge]
     closures: int
     version: int
+    entered: tuple[Keyframe, ...] | None = None
+    ids: tuple[int, ...] | None = None
+    localised: bool = True
+
+    @property
+    def new_keyframes(self) -> tuple[Keyframe, ...]:
+        """Keyframes that this result adds to the map."""
+        return (self.keyframe,) if self.entered is None else self.entered
+
+    @property
+    def keyframe_ids(self) -> tuple[int, ...]:
+        """Ids of the keyframes that `poses` are of."""
+        return tuple(range(len(self.poses))) if self.ids is None else self.ids
 
 
 class Backend(Protocol):

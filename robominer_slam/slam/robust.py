@@ -74,9 +74,7 @@ class RobustBackend:
 
     def _add_node(self, keyframe: Keyframe) -> None:
         level, tilt = levelled(keyframe.T_odom_base)
-        # Heights over the plane are the floor's: what touches walls goes into the map only.
-        floor = keyframe.points if keyframe.floor is None else keyframe.points[keyframe.floor]
-        points = voxel_filter(floor @ tilt.T, self._parameters.point_voxel)
+        points = voxel_filter(keyframe.floor_points @ tilt.T, self._parameters.point_voxel)
         k = keyframe.id
         self._patches[k] = Patch(points, keyframe.travelled)
         self._tilts[k] = tilt

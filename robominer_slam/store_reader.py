@@ -1,0 +1,130 @@
+"""Reads a saved map back from the store's database."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robominer_slam import geometry
+from robominer_slam.configuration.file import ConfigurationError
+from robominer_slam.configuration.model import SlamSection
+from robominer_slam.slam.keyframe import GraphEdge, Keyframe
+from robominer_slam.slam.saved_map import SavedMap
+from robominer_slam.store import UPPER, StoreError, open_database, unpack_points
+
+FloatArray = NDArray[np.float64]
+
+
+def find_map(connection: sqlite3.Connection, wanted: str, where: str) -> tuple[int, str]:
+    """Id and name of a map.
+
+    Args:
+        connection: to the database.
+        wanted: a map's name (the newest of that name), its id, or "" for the newest that has keyframes.
+        where: names the database in messages.
+
+    Raises:
+        StoreError: there is none such, or it has no keyframes.
+    """
+    rows = connection.execute(
+        "SELECT id, name FROM maps WHERE EXISTS (SELECT 1 FROM keyframes WHERE map_id = maps.id) ORDER BY id DESC"
+    ).fetchall()
+    for number, name in rows:
+        if wanted == "" or name == wanted:
+            return int(number), str(name)
+    for number, name in rows:
+        if str(number) == wanted:
+            return int(number), str(name)
+    known = ", ".join(f"{name!r} ({number})" if name else str(number) for number, name in rows)
+    if not rows:
+        raise StoreError(f"{where}: holds no map with keyframes; make one with [slam] start = 'new'")
+    raise StoreError(f"{where}: no map is called {wanted!r}; there are {known}")
+
+
+def load_map(path: Path, wanted: str = "", clock_offset_ns: int = 0) -> tuple[int, SavedMap]:
+    """A map by name or id, or the newest; its id in the database with it.
+
+    Args:
+        path: of the database.
+        wanted: see `find_map`.
+        clock_offset_ns: UNIX time less the clock that stamps shall be in.
+
+    Raises:
+        StoreError: as `find_map`, or the database cannot be read.
+    """
+    if not path.exists():
+        raise StoreError(f"[store] path = {str(path)!r}: is not there; expected a database with a saved map")
+    connection = open_database(path)
+    try:
+        map_id, name = find_map(connection, wanted, str(path))
+        keyframe_rows = connection.execute(
+            "SELECT id, stamp_unix_ns, T_odom_base, T_map_base, points FROM keyframes WHERE map_id = ? ORDER BY id",
+            (map_id,),
+        ).fetchall()
+        edge_rows = connection.execute(
+            "SELECT kind, i, j, T_i_j, information, weight FROM edges WHERE map_id = ? ORDER BY rowid", (map_id,)
+        ).fetchall()
+    except sqlite3.Error as error:
+        raise StoreError(f"[store] path = {str(path)!r}: cannot be read: {error}") from error
+    finally:
+        connection.close()
+    poses = np.array([_pose(row[3]) for row in keyframe_rows])
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    travelled = np.concatenate([[0.0], np.cumsum(steps)])
+    keyframes = tuple(
+        Keyframe(int(row[0]), int(row[1]) - clock_offset_ns, _pose(row[2]), unpack_points(row[4]), float(way))
+        for row, way in zip(keyframe_rows, travelled, strict=True)
+    )
+    known = {k.id for k in keyframes}
+    edges = tuple(_edge(row) for row in edge_rows if row[1] in known and row[2] in known)
+    return map_id, SavedMap(keyframes, poses, edges, name or str(map_id))
+
+
+def map_to_start_in(
+    slam: SlamSection, path: Path, clock_offset_ns: int = 0
+) -> tuple[int, SavedMap] | tuple[None, None]:
+    """The map that `[slam] start` and `map` ask for; none for a new one.
+
+    `continue` without a name begins a new map where there is none yet: a robot's first start is like any other.
+
+    Raises:
+        ConfigurationError: the method cannot start in a map.
+        StoreError: there is no such map.
+    """
+    if slam.start == "new":
+        return None, None
+    if slam.method != "robust":
+        raise ConfigurationError(
+            f"[slam] start = {slam.start!r}: method {slam.method!r} cannot find its place in a map; "
+            "expected method = 'robust' or start = 'new'"
+        )
+    if slam.start == "continue" and not slam.map and not has_maps(path):
+        return None, None
+    return load_map(path, slam.map, clock_offset_ns)
+
+
+def has_maps(path: Path) -> bool:
+    """Whether a database is there and holds a map with keyframes. Raises as `open_database`."""
+    if not path.exists() or path.stat().st_size == 0:
+        return False
+    connection = open_database(path)
+    try:
+        return connection.execute("SELECT 1 FROM keyframes LIMIT 1").fetchone() is not None
+    finally:
+        connection.close()
+
+
+def _pose(data: bytes) -> FloatArray:
+    vector = np.frombuffer(data, dtype="<f8")
+    return geometry.pose_matrix(vector[:3], vector[3:])
+
+
+def _edge(row: tuple[str, int, int, bytes, bytes, float]) -> GraphEdge:
+    kind, i, j, T, upper, weight = row
+    information = np.zeros((6, 6))
+    information[UPPER] = np.frombuffer(upper, dtype="<f4")
+    information = information + np.triu(information, 1).T
+    return GraphEdge("loop" if kind == "loop" else "odometry", int(i), int(j), _pose(T), information, float(weight))
