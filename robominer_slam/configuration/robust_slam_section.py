@@ -39,7 +39,7 @@ class ScanMatchingSection(Section):
     associations: int = parameter(1, "1", "how often planes are looked up in a match", low=1, high=10)
     least_inliers: float = parameter(0.4, "1", "share of touches that must fit", low=0.0, high=1.0)
     share: float = parameter(
-        0.3, "1", "of the touches' information that counts: they share their whiskers' errors", low=1e-4, high=1.0
+        0.2, "1", "of the touches' information that counts: they share their whiskers' errors", low=1e-4, high=1.0
     )
 
 
