@@ -115,7 +115,7 @@ def test_carrying_leaves_the_map_before_it_intact():
 
 
 def keyframe(k: int, breaks: int) -> Keyframe:
-    return Keyframe(k, k, np.eye(4), np.zeros((0, 3)), 0.25 * k, None, breaks)
+    return Keyframe(k, k, np.eye(4), np.zeros((0, 3)), 0.25 * k, breaks=breaks)
 
 
 def match(inliers: float, overlap: float = 1.0) -> SurfaceMatch:
