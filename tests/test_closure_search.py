@@ -19,7 +19,7 @@ ANCHOR, NEW = 2, 9
 
 def found(
     height, seed: int, truth=(0.05, 0.03, 0.04), *, off=(0.0, 0.0, 0.0), sigma=(0.08, 0.08, 0.05), source_height=None,
-    dz: float = 0.0, whisker_sigma: float = 0.0,
+    dz: float = 0.0, whisker_sigma: float = 0.0, spoilt: float = 0.0, **section: float,
 ) -> Closure | None:  # fmt: skip
     """Search for a keyframe at `truth`, seen from the anchor, that is predicted `off` beside it.
 
@@ -36,8 +36,9 @@ def found(
     patches = {k: Patch(touched(height, 500, pose), 0.25 * k) for k, pose in PASS.items()}
     truth = np.array(truth)
     source = touched(source_height or height, 700, truth) - [0.0, 0.0, dz]
+    source[rng.random(700) < spoilt, 2] += 0.05
     covariance = np.diag(np.square(sigma))
-    return ClosureSearch(SECTION, MODEL).find(
+    return ClosureSearch(ClosureSection(**section), MODEL).find(
         source, NEW, list(PASS), patches, PASS, dz, truth + off, covariance, np.zeros((3, 3)), ANCHOR
     )
 
@@ -47,16 +48,18 @@ def normalised(closure: Closure, truth) -> float:
     return float(error @ np.linalg.solve(closure.covariance, error))
 
 
-def test_right_places_are_accepted_with_honest_covariances():
+# The floor alone covers errors that are the same in all touches; without it the touches' own information must.
+@pytest.mark.parametrize(("seeds", "section"), [(100, {}), (50, {"floor": 0.0, "floor_yaw_deg": 0.0})])
+def test_right_places_are_accepted_with_honest_covariances(seeds, section):
     accepted = []
-    for seed in range(100):
+    for seed in range(seeds):
         rng = np.random.default_rng(seed + 500)
         truth, off = rng.uniform(-1, 1, 3) * [0.2, 0.1, 0.3], rng.normal(0, [0.08, 0.08, 0.05])
-        closure = found(rough(seed, relief=0.025), seed, truth, off=off, whisker_sigma=0.0012)
+        closure = found(rough(seed, relief=0.025), seed, truth, off=off, whisker_sigma=0.0012, **section)
         if closure is not None and closure.good:
             accepted.append((normalised(closure, truth), closure))
     squared = np.array([s for s, _ in accepted])
-    assert len(accepted) > 70
+    assert len(accepted) > 0.7 * seeds
     assert (squared < 7.8).mean() > 0.94, "95 % of a chi-square of three lie below 7.8"
     for _, closure in accepted:
         assert np.sqrt(np.linalg.eigvalsh(closure.covariance[:2, :2])[-1]) <= SECTION.max_sigma + 1e-9
@@ -70,8 +73,11 @@ def test_flat_ground_is_no_place(seed):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_corridor_leaves_the_place_along_it_free(seed):
-    closure = found(corridor, seed, off=(0.1, 0.0, 0.0), sigma=(0.15, 0.05, 0.05))
-    assert closure is None or not closure.good
+    for uniqueness in (SECTION.uniqueness, 1.0):
+        closure = found(corridor, seed, off=(0.1, 0.0, 0.0), sigma=(0.15, 0.05, 0.05), uniqueness=uniqueness)
+        assert closure is not None
+        assert not closure.good
+        assert closure.covariance[0, 0] > SECTION.max_sigma**2
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -86,6 +92,11 @@ def test_of_two_equal_places_neither_is_taken(seed):
 def test_other_ground_is_refused(seed):
     closure = found(rough(seed), seed, source_height=rough(seed + 50))
     assert closure is None or not closure.good
+
+
+def test_a_place_where_many_touches_do_not_fit_is_refused():
+    clean, some, many = (found(rough(2), 2, spoilt=share) for share in (0.0, 0.1, 0.3))
+    assert [c is not None and c.good for c in (clean, some, many)] == [True, True, False]
 
 
 def test_a_place_far_from_the_prediction_is_refused_however_well_it_fits():

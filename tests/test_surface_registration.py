@@ -113,8 +113,9 @@ def test_a_corridor_tells_nothing_along_it(seed):
 def test_the_prior_holds_what_the_ground_leaves_free():
     prior = np.diag(np.array([0.0005, 0.02, 0.02, 0.02]) ** -2.0)
     points = touches(corridor, np.random.default_rng(1), 300, HALF, (0.0, 0.02, 0.0))
-    found = fit(ground(corridor, 1), points, np.zeros(4), prior, associations=4)
+    found = fit(ground(corridor, 1), points, np.zeros(4), prior, associations=8)
     assert abs(found.pose[0]) < 0.001
+    np.testing.assert_allclose(found.gradient + prior @ found.pose, 0.0, atol=1e-3 * np.abs(found.gradient).max())
     assert found.pose[1] == pytest.approx(0.02, abs=0.001)
 
 

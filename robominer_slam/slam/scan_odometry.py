@@ -99,12 +99,15 @@ class ScanOdometry:
         offset = found.pose - pose
         offset[YAW] = wrap_angle(offset[YAW])
         # With the common height left free: what remains is about x, y and heading.
-        information = height_left_free(found.information) * self._parameters.share
+        # The touches' noise pulls at d as much as H says, whatever of H the slopes' errors have made up: with
+        # H0 d = -g, the information of d is H0 H^-1 H0.
+        known, apparent = height_left_free(found.information), height_left_free(found.curvature)
+        information = known @ np.linalg.solve(apparent + 1e-9 * np.eye(3), known) * self._parameters.share
         # The least-squares offset of the touches alone: H d = -g at the predicted pose.
         H = found.curvature
         gradient = found.gradient - H @ offset
         reduced = gradient[:3] - H[:3, Z] * gradient[Z] / max(H[Z, Z], 1e-12)
-        return ScanCorrection(_least(height_left_free(found.information), -reduced), information, float(offset[Z]))
+        return ScanCorrection(_least(known, -reduced), information, float(offset[Z]))
 
     def add(self, pose: FloatArray, points: FloatArray) -> None:
         """Put a frame's contacts (in base_link, levelled) into the map at its corrected pose (x, y, yaw, z)."""
