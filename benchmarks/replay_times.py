@@ -1,9 +1,9 @@
-"""CPU time per whisker frame and per keyframe on recordings, by replay.
+"""Time per whisker frame and per keyframe on recordings, by replay.
 
     python -m benchmarks.replay_times [RECORDING ...] [--source odometry|fused]
 
-Frames are timed without the back-end, keyframes are the back-end's own time. CPU time does not count what other
-processes take, but a shared machine makes it larger all the same.
+Frames are timed without the back-end and without reading the recording, keyframes are the back-end's own time. Wall
+time of one thread: on a shared machine, quote the least of several runs.
 """
 
 from __future__ import annotations
@@ -11,45 +11,37 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from pathlib import Path
-from time import thread_time
+from time import perf_counter
 
 import numpy as np
 
+from robominer_slam.assembly import build_pipeline
 from robominer_slam.configuration.overrides import overridden
-from robominer_slam.frame_result import FrameResult
-from robominer_slam.replay import ReplayInputs, prepare, replay
-from robominer_slam.slam.keyframe import BackendResult, Keyframe
-from robominer_slam.slam.robust import RobustBackend
+from robominer_slam.replay import KIND_DEVICES, ReplayInputs, prepare
 
 RECORDINGS = Path(__file__).resolve().parents[1] / "tests" / "recordings"
 
 
 def times_ms(inputs: ReplayInputs) -> tuple[list[float], list[float]]:
-    """CPU times of frames without the back-end, and of keyframes in the back-end, ms."""
+    """Times of frames without the back-end (reading the recording left out), and of keyframes in the back-end, ms."""
+    pipeline = build_pipeline(inputs.configuration, inputs.layout, inputs.model, "synchronous")
+    if pipeline.runner is None:
+        raise ValueError("the method has no back-end to time; expected robust or thesis")
     frames: list[float] = []
     keyframes: list[float] = []
-    process = RobustBackend.process
-    last, inside = thread_time(), 0.0
-
-    def timed(backend: RobustBackend, keyframe: Keyframe) -> BackendResult:
-        nonlocal inside
-        start = thread_time()
-        result = process(backend, keyframe)
-        inside += thread_time() - start
-        keyframes.append(1e3 * (thread_time() - start))
-        return result
-
-    def on_frame(_: FrameResult) -> None:
-        nonlocal last, inside
-        now = thread_time()
-        frames.append(1e3 * (now - last - inside))
-        last, inside = now, 0.0
-
-    RobustBackend.process = timed  # type: ignore[method-assign]
-    try:
-        replay(inputs, on_frame)
-    finally:
-        RobustBackend.process = process  # type: ignore[method-assign]
+    spent = busy = 0.0
+    for _, measurement in inputs.recording:
+        device = KIND_DEVICES.get(type(measurement).__name__, "screws")
+        start = perf_counter()
+        results = pipeline.add(device, measurement)
+        spent += perf_counter() - start
+        inside, busy = pipeline.runner.busy_s - busy, pipeline.runner.busy_s
+        spent -= inside
+        if inside > 0.0:
+            keyframes.append(1e3 * inside)
+        if results:
+            frames.append(1e3 * spent / len(results))
+            spent = 0.0
     return frames, keyframes
 
 

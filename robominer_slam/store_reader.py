@@ -13,7 +13,8 @@ from robominer_slam.configuration.file import ConfigurationError
 from robominer_slam.configuration.model import SlamSection
 from robominer_slam.slam.keyframe import GraphEdge, Keyframe
 from robominer_slam.slam.saved_map import SavedMap
-from robominer_slam.store import UPPER, StoreError, open_database, unpack_points
+from robominer_slam.store import UPPER
+from robominer_slam.store_database import StoreError, open_database, unpack_points
 
 FloatArray = NDArray[np.float64]
 

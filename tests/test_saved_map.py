@@ -21,7 +21,8 @@ from robominer_slam.replay_session import open_session, split_name
 from robominer_slam.slam.keyframe import BackendResult
 from robominer_slam.slam.level_map import from_saved
 from robominer_slam.slam.saved_map import SavedMap
-from robominer_slam.store import MapStore, StoreError
+from robominer_slam.store import MapStore
+from robominer_slam.store_database import StoreError
 from robominer_slam.store_reader import load_map, map_to_start_in
 from sim_backend.demo import program
 from sim_backend.recorder import record

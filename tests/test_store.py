@@ -11,7 +11,8 @@ import pytest
 
 from robominer_slam import geometry
 from robominer_slam.slam.keyframe import BackendResult, GraphEdge, Keyframe, Merge
-from robominer_slam.store import MapStore, StoreError, open_database, pack_points, unpack_points
+from robominer_slam.store import MapStore
+from robominer_slam.store_database import StoreError, open_database, pack_points, unpack_points
 from tests.conftest import planar
 
 

@@ -20,7 +20,7 @@ from robominer_slam.evaluation.run_record import ResultsError
 from robominer_slam.evaluation.trajectory import TrajectoryError
 from robominer_slam.layout import LayoutError
 from robominer_slam.publishing.zenoh_session import ZenohSetupError
-from robominer_slam.store import StoreError
+from robominer_slam.store_database import StoreError
 
 #: Errors that are the user's to mend; anything else is ours and shows a traceback.
 USER_ERRORS = (
