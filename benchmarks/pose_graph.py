@@ -60,15 +60,14 @@ def our_iterations(content: G2oGraph, optimum: float) -> int:
     return 0
 
 
-def gtsam_seconds(content: G2oGraph, optimum: float) -> Callable[[], float]:
-    """A function that runs GTSAM once and returns the seconds it took."""
+def gtsam_problem(content: G2oGraph) -> tuple[Any, Any]:
+    """GTSAM's values and factors of a graph, without a prior on the first pose."""
     import gtsam
 
     values, factors = gtsam.Values(), gtsam.NonlinearFactorGraph()
     plane = content.dim == 2
     pose_of: Callable[[Any], Any] = (lambda pose: gtsam.Pose2(*pose)) if plane else gtsam.Pose3
     between = gtsam.BetweenFactorPose2 if plane else gtsam.BetweenFactorPose3
-    equal = gtsam.NonlinearEqualityPose2 if plane else gtsam.NonlinearEqualityPose3
     for k, pose in enumerate(content.poses):
         values.insert(k, pose_of(pose))
     for i, j, Z, Omega in zip(
@@ -76,6 +75,17 @@ def gtsam_seconds(content: G2oGraph, optimum: float) -> Callable[[], float]:
     ):
         ordered = Omega if plane else Omega[np.ix_(ROTATION_FIRST, ROTATION_FIRST)]
         factors.add(between(i, j, pose_of(Z), gtsam.noiseModel.Gaussian.Information(ordered)))
+    return values, factors
+
+
+def gtsam_seconds(content: G2oGraph, optimum: float) -> Callable[[], float]:
+    """A function that runs GTSAM once and returns the seconds it took."""
+    import gtsam
+
+    plane = content.dim == 2
+    values, factors = gtsam_problem(content)
+    pose_of: Callable[[Any], Any] = (lambda pose: gtsam.Pose2(*pose)) if plane else gtsam.Pose3
+    equal = gtsam.NonlinearEqualityPose2 if plane else gtsam.NonlinearEqualityPose3
     factors.add(equal(0, pose_of(content.poses[0])))
 
     def once() -> float:

@@ -30,6 +30,7 @@ from rich.table import Table
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.false_loops import agreeing, is_loop, optimum, pose_graph, position_rmse, scattered
+from benchmarks.pose_graph import gtsam_problem
 from robominer_slam.geometry import FloatArray
 from robominer_slam.slam.g2o_format import G2oGraph, parse_g2o
 from robominer_slam.slam.pose_graph import OptimizationOptions, PoseGraphError
@@ -40,7 +41,6 @@ DEFAULT_DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "pose_g
 LIMITS = {"intel": 0.05, "M3500": 0.05, "smallGrid3D": 0.1}
 SHARES = (0.0, 0.1, 0.3, 0.5, 0.7)
 KERNELS = {"L2": None, "Huber": "huber", "DCS": "dcs"}
-ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
 #: Above so many wrong loops the matrix of all loops fills up, and the rivals are left out.
 RIVALS_UP_TO = {"intel": 800, "M3500": 300}
 
@@ -56,17 +56,9 @@ def by_gnc(content: G2oGraph) -> FloatArray:
     import gtsam
 
     plane = content.dim == 2
-    values, factors = gtsam.Values(), gtsam.NonlinearFactorGraph()
+    values, factors = gtsam_problem(content)
     pose_of: Callable[[Any], Any] = (lambda pose: gtsam.Pose2(*pose)) if plane else gtsam.Pose3
-    between = gtsam.BetweenFactorPose2 if plane else gtsam.BetweenFactorPose3
     prior = gtsam.PriorFactorPose2 if plane else gtsam.PriorFactorPose3
-    for k, pose in enumerate(content.poses):
-        values.insert(k, pose_of(pose))
-    for i, j, Z, Omega in zip(
-        content.i.tolist(), content.j.tolist(), content.measurements, content.information, strict=True
-    ):
-        ordered = Omega if plane else Omega[np.ix_(ROTATION_FIRST, ROTATION_FIRST)]
-        factors.add(between(i, j, pose_of(Z), gtsam.noiseModel.Gaussian.Information(ordered)))
     d = 3 if plane else 6
     factors.add(prior(0, pose_of(content.poses[0]), gtsam.noiseModel.Isotropic.Sigma(d, 1e-6)))
     parameters = gtsam.GncLMParams()

@@ -15,14 +15,12 @@ from numpy.typing import NDArray
 from drivers.measurement import ImuSample, Measurement, ScrewAngles, ScrewSpeeds
 from robominer_slam.configuration.model import EstimationSection
 from robominer_slam.estimation.odometry_state import OdometryState
-from robominer_slam.estimation.screw_speeds import ScrewSpeedAssembly
+from robominer_slam.estimation.screw_speeds import ScrewAngleSpeeds, ScrewSpeedAssembly
 
 FloatArray = NDArray[np.float64]
 
 X, Y, YAW, VX, VY, WZ, BIAS = range(7)
 STATE = 7
-#: A gap in the screws' readings longer than this has no meaningful mean speed.
-MAX_SCREW_INTERVAL_S = 0.5
 #: Deviation of the velocity, m/s and rad/s, of a robot whose screws stand still: it may creep.
 STILL_SIGMA = 0.002
 
@@ -90,13 +88,12 @@ class FusedOdometry:
         self._filter.x = np.zeros(STATE)
         self._filter.P = np.diag([0.0, 0.0, 0.0, 1e-4, 1e-4, 1e-4, noise.sigma_gyro_bias_start**2])
         self._stamp_ns: int | None = None
-        self._screws: ScrewAngles | None = None
+        self._angles = ScrewAngleSpeeds()
         self._speeds = ScrewSpeedAssembly()
         self._R_gyro = np.array([[noise.sigma_gyro**2]])
         self._R_screws = np.diag(np.square([noise.sigma_screws_vx, noise.sigma_screws_vy, noise.sigma_screws_wz]))
         self._slip = np.array([noise.screw_slip, noise.screw_slip, noise.screw_slip_turn])
         self._R_still = np.eye(3) * STILL_SIGMA**2
-        self.stale = 0
 
     def add(self, measurement: Measurement) -> None:
         """Take an IMU sample or a screws' reading; others are ignored."""
@@ -105,7 +102,10 @@ class FusedOdometry:
                 self._predict(measurement.stamp_ns)
                 self._filter.update(gyro[2:3], lambda _: H_GYRO, gyro_measurement, self._R_gyro)
             case ScrewAngles():
-                self._add_angles(measurement)
+                speed = self._angles.add(measurement)
+                if speed is not None:
+                    self._predict(measurement.stamp_ns)
+                    self._update_screws(speed)
             case ScrewSpeeds():
                 speed = self._speeds.add(measurement)
                 if speed is not None:
@@ -135,20 +135,14 @@ class FusedOdometry:
         )
 
     @property
+    def stale(self) -> int:
+        """Readings of the screws' angles out of order or after a gap."""
+        return self._angles.stale
+
+    @property
     def gyro_bias(self) -> float:
         """Estimated gyro bias, rad/s."""
         return float(self._filter.x[BIAS])
-
-    def _add_angles(self, reading: ScrewAngles) -> None:
-        previous, self._screws = self._screws, reading
-        if previous is None:
-            return
-        interval = (reading.stamp_ns - previous.stamp_ns) * 1e-9
-        if not 0.0 < interval <= MAX_SCREW_INTERVAL_S:
-            self.stale += 1
-            return
-        self._predict(reading.stamp_ns)
-        self._update_screws((reading.angle - previous.angle) / interval)
 
     def _update_screws(self, speed: FloatArray) -> None:
         if np.abs(speed).max() < self._noise.still_screw_speed:

@@ -43,15 +43,13 @@ from robominer_slam.estimation.planar_motion import (
 )
 from robominer_slam.estimation.planar_start import MATCH_STATES, ODOMETRY_BIAS
 from robominer_slam.estimation.scan_match import match_measurement, relative_covariance
-from robominer_slam.estimation.screw_speeds import ScrewSpeedAssembly
+from robominer_slam.estimation.screw_speeds import MAX_INTERVAL_S, ScrewAngleSpeeds, ScrewSpeedAssembly
 from robominer_slam.estimation.spatial_pose import SpatialPose
 from robominer_slam.estimation.turn_comparison import TurnComparison
 
 FloatArray = NDArray[np.float64]
 Source = Literal["fused", "odometry"]
 
-#: A gap in readings longer than this has no meaningful mean speed.
-MAX_INTERVAL_S = 0.5
 #: Squared deviations between screws and gyro beyond which the screws are trusted less.
 DISAGREEMENT = 4.0
 
@@ -92,12 +90,12 @@ class RobustOdometry:
         #: What a disagreement with the gyro makes of the screws' variance.
         self._distrust = 1.0
         self._stamp_ns: int | None = None
-        self._screws: ScrewAngles | None = None
+        self._angles = ScrewAngleSpeeds()
         self._odometry_ns: int | None = None
         self._screws_ns: int | None = None
         self._input, self._Q_input = np.zeros(2), np.zeros((2, 2))
         self._state: OdometryState | None = None
-        self.stale = 0
+        self._stale = 0
 
     def add(self, measurement: Measurement) -> None:
         """Take a measurement of the source; others are ignored."""
@@ -110,11 +108,9 @@ class RobustOdometry:
             case ImuSample():
                 self._imu.add(measurement)
             case ScrewAngles():
-                self._add_angles(measurement)
+                self._take_speed(measurement.stamp_ns, self._angles.add(measurement))
             case ScrewSpeeds():
-                speed = self._speeds.add(measurement)
-                if speed is not None:
-                    self._update_screws(measurement.stamp_ns, speed)
+                self._take_speed(measurement.stamp_ns, self._speeds.add(measurement))
 
     def add_contacts(self, stamp_ns: int, contacts: Contacts) -> None:
         """Take the contacts of a whisker frame; `state_at` then knows of them."""
@@ -196,6 +192,11 @@ class RobustOdometry:
         return self._filter.x[self._bias].copy()
 
     @property
+    def stale(self) -> int:
+        """Measurements of motion left out: out of order, after a gap, or faster than the robot is."""
+        return self._stale + self._angles.stale
+
+    @property
     def outliers(self) -> int:
         """Measurements beyond the gate."""
         return self._filter.outliers
@@ -206,7 +207,7 @@ class RobustOdometry:
             return
         interval = (sample.stamp_ns - previous) * 1e-9
         if not 0.0 < interval <= MAX_INTERVAL_S:
-            self.stale += 1
+            self._stale += 1
             return
         # A mean over the interval holds for its middle.
         self._predict(sample.stamp_ns - round(0.5e9 * interval))
@@ -214,22 +215,14 @@ class RobustOdometry:
         x = self._filter.x
         self._filter.correct(sample.velocity - self._H_odometry @ x, self._H_odometry, variance * np.eye(3))
 
-    def _add_angles(self, reading: ScrewAngles) -> None:
-        previous, self._screws = self._screws, reading
-        if previous is None:
+    def _take_speed(self, stamp_ns: int, speed: FloatArray | None) -> None:
+        if speed is None:
             return
-        interval = (reading.stamp_ns - previous.stamp_ns) * 1e-9
-        if not 0.0 < interval <= MAX_INTERVAL_S:
-            self.stale += 1
-            return
-        self._update_screws(reading.stamp_ns, (reading.angle - previous.angle) / interval)
-
-    def _update_screws(self, stamp_ns: int, speed: FloatArray) -> None:
         before, self._screws_ns = self._screws_ns, stamp_ns
         settings, comparison = self._settings, self._comparison
         screws = self._screw_matrix @ speed
         if math.hypot(screws[0], screws[1]) > settings.fastest:
-            self.stale += 1
+            self._stale += 1
             return
         still = float(np.abs(speed).max()) < settings.still_screw_speed
         self._input = screws[:2]

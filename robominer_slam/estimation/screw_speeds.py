@@ -1,16 +1,42 @@
-"""Speeds of screws that are reported one by one, brought together to all four."""
+"""Speeds of the four screws: from angles read one after the other, or reported one by one."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.measurement import ScrewSpeeds
+from drivers.measurement import ScrewAngles, ScrewSpeeds
 
 FloatArray = NDArray[np.float64]
 
 #: RM3's boards report every 0.2 s; one that is silent for two and a half reports is not known any more.
 MAX_AGE_NS = 500_000_000
+#: A gap between two readings of angles longer than this has no meaningful mean speed.
+MAX_INTERVAL_S = 0.5
+
+
+class ScrewAngleSpeeds:
+    """Mean speeds between readings of the screws' cumulative angles.
+
+    Attributes:
+        stale: readings that gave none, out of order or after a gap.
+    """
+
+    def __init__(self) -> None:
+        self._before: ScrewAngles | None = None
+        self.stale = 0
+
+    def add(self, reading: ScrewAngles) -> FloatArray | None:
+        """Speeds since the reading before, shape (4,), rad/s; None for the first and where the gap is too long."""
+        before, self._before = self._before, reading
+        if before is None:
+            return None
+        interval = (reading.stamp_ns - before.stamp_ns) * 1e-9
+        if not 0.0 < interval <= MAX_INTERVAL_S:
+            self.stale += 1
+            return None
+        speed: FloatArray = (reading.angle - before.angle) / interval
+        return speed
 
 
 class ScrewSpeedAssembly:

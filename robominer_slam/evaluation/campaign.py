@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import multiprocessing
 import signal
 from collections import Counter
@@ -12,13 +13,21 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import robominer_slam
-from drivers.recording_reader import Recording
+from calibration.file_format import CalibrationFileError
+from drivers.recording_reader import Recording, RecordingError
+from robominer_slam.configuration.file import ConfigurationError
 from robominer_slam.configuration.model import Configuration
 from robominer_slam.configuration.overrides import Override, Variant
 from robominer_slam.evaluation.run_record import DriveName, ResultsError, RunKey, RunRecord
 from robominer_slam.evaluation.run_result import saved_record
 from robominer_slam.evaluation.run_task import RunTask, SurfaceOf, evaluate_run
+from robominer_slam.evaluation.trajectory import TrajectoryError
+from robominer_slam.layout import LayoutError
 
+log = logging.getLogger(__name__)
+
+#: What may be wrong with a recording: one line says it. Anything else is ours and leaves a traceback in the log.
+OF_THE_RECORDING = (CalibrationFileError, ConfigurationError, LayoutError, OSError, RecordingError, TrajectoryError)
 RUNS = "runs"
 #: Packages that decide what a replay gives, and what in them does not.
 CODE = ("calibration", "drivers", "robominer_slam")
@@ -176,7 +185,9 @@ def _one(task: RunTask, folder: Path, code: str, surface_of: SurfaceOf | None) -
         if record is not None:
             return record, True
         result = evaluate_run(task, surface_of)
-    except Exception as error:  # noqa: BLE001 - a method that fails on one drive must not take the others with it
+    except Exception as error:
+        if not isinstance(error, OF_THE_RECORDING):
+            log.exception("run %s failed", task.file_name)
         return Failure(task, f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else 'no message'}")
     result.save(path, fingerprint)
     return result.record, False
