@@ -22,6 +22,8 @@ FloatArray = NDArray[np.float64]
 #: Touches that make up the surface at one place, at most and at least.
 NEIGHBOURS = 10
 LEAST_NEIGHBOURS = 4
+#: Of a plane: so many of the residuals go into the fit itself.
+UNKNOWNS = 3
 #: A few touches may lie in a plane by chance: their misfit, in variances, counts as no less.
 LEAST_MISFIT = 0.1
 
@@ -104,7 +106,7 @@ class Surface:
         fitted = (covariance @ (XtW @ z[:, :, None]))[:, :, 0]
         residual = z - (X @ fitted[:, :, None])[:, :, 0]
         count = near.sum(axis=1)
-        misfit = (weight * residual**2).sum(axis=1) / np.maximum(count - 1, 1)
+        misfit = (weight * residual**2).sum(axis=1) / np.maximum(count - UNKNOWNS, 1)
         known = count >= LEAST_NEIGHBOURS
         variance = covariance[:, 0, 0] * np.maximum(misfit, 1.0) + model.touch_sigma**2
         # The estimate is C X'W z: errors of z with covariance W^-1 reach it as C X'WX C = C - C prior C.

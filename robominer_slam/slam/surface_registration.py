@@ -27,8 +27,8 @@ X, Y, YAW, Z = range(4)
 REWEIGHTINGS = 3
 #: Width of the Cauchy kernel, in sigmas.
 KERNEL_WIDTH = 2.5
-#: What noise adds to the information is a mean: with less than twice of it, closures came about along a corridor.
-NOISE_MARGIN = 2.0
+#: What noise adds to the information varies about its mean, the more the fewer touches carry it: half as much again.
+NOISE_MARGIN = 1.5
 #: Deviation of headings within a surface, rad.
 TURN_SIGMA = 0.03
 #: Residuals under this many sigmas count as fitting.
