@@ -121,9 +121,8 @@ def build_scan_odometry(configuration: Configuration, layout: WhiskerLayout) -> 
     robust = configuration.slam.robust
     if configuration.slam.method != "robust" or not robust.scan_matching.enabled:
         return None
-    s = robust.surface
     reach = float((np.abs(layout.p_base[:, :2]).max(axis=1) + layout.length).max()) + 0.1
-    return ScanOdometry(robust.scan_matching, SurfaceModel(s.touch_sigma, s.curvature, s.slope_sigma, s.reach), reach)
+    return ScanOdometry(robust.scan_matching, SurfaceModel.of(robust.surface), reach)
 
 
 def build_robust_odometry(configuration: Configuration, layout: WhiskerLayout) -> RobustOdometry:

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 
 from robominer_slam.geometry_planar import (
     T_from_xyyaw,
+    levelled,
     rotation_2d,
     se2_adjoint,
     se2_compose,
@@ -57,6 +58,7 @@ __all__ = [
     "from_vector7",
     "hat",
     "inverse",
+    "levelled",
     "matrix_from_rpy",
     "matrix_to_quaternion",
     "normalise_pose",

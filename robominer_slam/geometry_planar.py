@@ -115,3 +115,11 @@ def se2_right_jacobian_inverse(twist: ArrayLike) -> FloatArray:
 def se2_right_jacobian(twist: ArrayLike) -> FloatArray:
     """Jr (..., 3, 3) of twists (vx, vy, omega), |omega| < 2 pi."""
     return np.asarray(np.linalg.inv(se2_right_jacobian_inverse(twist)))
+
+
+def levelled(T: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """A pose as x, y, heading, z, shape (4,), and the tilt R with R_map_base = R_z(heading) R, shape (3, 3)."""
+    yaw = float(np.arctan2(T[1, 0], T[0, 0]))
+    c, s = np.cos(yaw), np.sin(yaw)
+    R_yaw = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return np.array([T[0, 3], T[1, 3], yaw, T[2, 3]]), R_yaw.T @ T[:3, :3]

@@ -29,7 +29,6 @@ from robominer_slam.slam.backend_runner import BackendRunner
 from robominer_slam.slam.composite_scan import CompositeScan
 from robominer_slam.slam.keyframe import BackendResult, Keyframe
 from robominer_slam.slam.place_prior import PlacePrior
-from robominer_slam.slam.robust import levelled
 from robominer_slam.slam.scan_odometry import ScanOdometry
 from robominer_slam.whisker_monitor import WhiskerMonitor
 
@@ -216,7 +215,7 @@ class Pipeline:
         scans, reckoning = self._scan_odometry, self._dead_reckoning
         if scans is None or not isinstance(reckoning, TakesScanMatches):
             return odometry
-        level, tilt = levelled(planar_pose(odometry))
+        level, tilt = geometry.levelled(planar_pose(odometry))
         points = points @ tilt.T
         covariance = np.zeros((4, 4))
         covariance[:3, :3] = reckoning.relative_covariance()
@@ -225,7 +224,7 @@ class Pipeline:
         if correction is not None:
             reckoning.correct_pose(stamp, correction.offset, correction.information)
             odometry = reckoning.state_at(stamp)
-            level, _ = levelled(planar_pose(odometry))
+            level, _ = geometry.levelled(planar_pose(odometry))
         if scans.breaks > self._breaks:
             self._broken(scans.breaks)
         scans.add(level, points)
@@ -256,7 +255,7 @@ class Pipeline:
                 keyframe = replace(keyframe, breaks=self._scan_odometry.breaks)
             if self._prior is not None:
                 # Told some way before the keyframe was complete.
-                x, y, yaw, _ = levelled(self._T_map_odom @ T_odom_base)[0].tolist()
+                x, y, yaw, _ = geometry.levelled(self._T_map_odom @ T_odom_base)[0].tolist()
                 keyframe = replace(keyframe, prior=replace(self._prior, x=x, y=y, yaw=yaw))
                 self._prior, self._sought_from = None, keyframe.id
             self._odometry_of_keyframe[keyframe.id] = odometry.covariance

@@ -10,7 +10,7 @@ from robominer_slam.configuration.robust_slam_section import SurfaceSection
 from robominer_slam.slam.surface import SurfaceModel
 
 SECTION = SurfaceSection()
-MODEL = SurfaceModel(SECTION.touch_sigma, SECTION.curvature, SECTION.slope_sigma, SECTION.reach)
+MODEL = SurfaceModel.of(SECTION)
 #: Of a touch's height, m.
 NOISE = 0.001
 

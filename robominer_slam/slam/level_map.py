@@ -18,7 +18,6 @@ from robominer_slam.slam.keyframe import GraphEdge
 from robominer_slam.slam.keyframe_nodes import KeyframeNodes
 from robominer_slam.slam.level_edges import LevelEdge
 from robominer_slam.slam.published_edges import PLANAR
-from robominer_slam.slam.robust import levelled
 from robominer_slam.slam.saved_map import SavedMap
 from robominer_slam.slam.surface_registration import placed
 
@@ -89,7 +88,7 @@ def from_saved(saved: SavedMap, voxel: float) -> LevelMap:
     """
     known = LevelMap()
     for keyframe, T in zip(saved.keyframes, saved.poses, strict=True):
-        level, tilt = levelled(T)
+        level, tilt = geometry.levelled(T)
         k = keyframe.id
         known.poses[k], known.heights[k], known.tilts[k] = level[:3], float(level[3]), tilt
         known.travelled[k] = keyframe.travelled
@@ -110,7 +109,7 @@ def _levelled_edge(edge: GraphEdge, known: LevelMap) -> LevelEdge:
         T = edge.T_i_j.copy()
         T[:3, :3] = known.tilts[edge.i] @ T[:3, :3] @ known.tilts[edge.j].T
         T[:3, 3] = known.tilts[edge.i] @ T[:3, 3]
-        level, _ = levelled(T)
+        level, _ = geometry.levelled(T)
         Z, dz = level[:3], float(level[3])
     return _edge(edge.kind, edge.i, edge.j, Z, information, dz, dz_information, edge.weight > 0.0)
 

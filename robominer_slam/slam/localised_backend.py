@@ -28,7 +28,6 @@ from robominer_slam.slam.map_ground import MapGround
 from robominer_slam.slam.patch_memory import PatchPages
 from robominer_slam.slam.place_prior import PlacePrior
 from robominer_slam.slam.relocalisation import Place, Relocaliser, SessionKeyframe
-from robominer_slam.slam.robust import levelled
 from robominer_slam.slam.saved_map import SavedMap
 from robominer_slam.slam.session_backend import SessionBackend
 from robominer_slam.slam.surface import SurfaceModel
@@ -60,8 +59,7 @@ class LocalisedBackend:
             pages: makes a place for touches that do not fit into memory; None keeps all there.
         """
         self._parameters = parameters
-        s = parameters.surface
-        self._model = SurfaceModel(s.touch_sigma, s.curvature, s.slope_sigma, s.reach)
+        self._model = SurfaceModel.of(parameters.surface)
         self._frozen = frozen
         self._pages = pages
         self._session = self._new_session()
@@ -171,7 +169,7 @@ class LocalisedBackend:
         return Closure(anchor, place.id, Z, R @ covariance @ R.T, dz, place.match, place.lead, 0.0, True)
 
     def _session_keyframe(self, keyframe: Keyframe) -> SessionKeyframe:
-        level, tilt = levelled(keyframe.T_odom_base)
+        level, tilt = geometry.levelled(keyframe.T_odom_base)
         points = voxel_filter(keyframe.floor_points @ tilt.T, self._parameters.point_voxel)
         return SessionKeyframe(keyframe.id, level, points, keyframe.travelled)
 
@@ -280,7 +278,7 @@ class LocalisedBackend:
                     self._relocaliser, self._second_opinion, self._tracker = self._second_opinion, None, None
                     return self._unknown(keyframe)
         assert self._tracker is not None
-        level, tilt = self._tracker.pose, levelled(keyframe.T_odom_base)[1]
+        level, tilt = self._tracker.pose, geometry.levelled(keyframe.T_odom_base)[1]
         T = geometry.T_from_xyyaw(level[:3])
         T[2, 3] = level[3]
         T[:3, :3] = T[:3, :3] @ tilt

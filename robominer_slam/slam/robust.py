@@ -57,10 +57,7 @@ class RobustBackend:
     def __init__(self, parameters: RobustSlamSection, pages: PatchPages | None = None) -> None:
         self._parameters = parameters
         bounds = parameters.bounds
-        s = parameters.surface
-        self._search = ClosureSearch(
-            parameters.closure, SurfaceModel(s.touch_sigma, s.curvature, s.slope_sigma, s.reach)
-        )
+        self._search = ClosureSearch(parameters.closure, SurfaceModel.of(parameters.surface))
         self._graph = KeyframeGraph()
         self._patches = PatchMemory(bounds.max_points_in_memory, pages)
         self._map = BoundedMap(bounds, self._graph, self._patches)
@@ -94,7 +91,7 @@ class RobustBackend:
     # ------------------------------------------------------------------------------------------------ nodes
 
     def _add_node(self, keyframe: Keyframe) -> None:
-        level, tilt = levelled(keyframe.T_odom_base)
+        level, tilt = geometry.levelled(keyframe.T_odom_base)
         points = voxel_filter(keyframe.floor_points @ tilt.T, self._parameters.point_voxel)
         k = keyframe.id
         self._patches[k] = Patch(points, keyframe.travelled)
@@ -102,7 +99,7 @@ class RobustBackend:
         if self._last is None:
             graph.nodes.append(k, level[:3], float(level[3]), tilt, keyframe.travelled)
             return
-        last, _ = levelled(self._last.T_odom_base)
+        last, _ = geometry.levelled(self._last.T_odom_base)
         Z = geometry.se2_compose(geometry.se2_inverse(last[:3]), level[:3])
         dz = float(level[3] - last[3])
         motion = keyframe.motion
@@ -361,14 +358,6 @@ class RobustBackend:
                 "points.fetched": self._patches.fetched,
             },
         )
-
-
-def levelled(T: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """A pose as x, y, heading, z, shape (4,), and the tilt R with R_map_base = R_z(heading) R, shape (3, 3)."""
-    yaw = float(np.arctan2(T[1, 0], T[0, 0]))
-    c, s = np.cos(yaw), np.sin(yaw)
-    R_yaw = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return np.array([T[0, 3], T[1, 3], yaw, T[2, 3]]), R_yaw.T @ T[:3, :3]
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:

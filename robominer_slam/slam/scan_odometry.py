@@ -38,12 +38,10 @@ class ScanCorrection:
     Attributes:
         offset: of (x, y, yaw) in odom, measured less predicted, shape (3,).
         information: of it, already discounted, shape (3, 3); directions that nothing constrains have none.
-        height: offset of z, m.
     """
 
     offset: FloatArray
     information: FloatArray
-    height: float
 
 
 class ScanOdometry:
@@ -107,7 +105,7 @@ class ScanOdometry:
         H = found.curvature
         gradient = found.gradient - H @ offset
         reduced = gradient[:3] - H[:3, Z] * gradient[Z] / max(H[Z, Z], 1e-12)
-        return ScanCorrection(_least(known, -reduced), information, float(offset[Z]))
+        return ScanCorrection(_least(known, -reduced), information)
 
     def add(self, pose: FloatArray, points: FloatArray) -> None:
         """Put a frame's contacts (in base_link, levelled) into the map at its corrected pose (x, y, yaw, z)."""

@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from robominer_slam.configuration.robust_slam_section import SurfaceSection
+
 FloatArray = NDArray[np.float64]
 
 #: Touches that make up the surface at one place, at most and at least.
@@ -43,6 +45,11 @@ class SurfaceModel:
     curvature: float
     slope_sigma: float
     reach: float
+
+    @classmethod
+    def of(cls, section: SurfaceSection) -> SurfaceModel:
+        """As configured."""
+        return cls(section.touch_sigma, section.curvature, section.slope_sigma, section.reach)
 
 
 @dataclass(frozen=True, slots=True)
