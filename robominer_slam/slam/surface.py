@@ -113,12 +113,15 @@ class Surface:
         fitted = (covariance @ (XtW @ z[:, :, None]))[:, :, 0]
         residual = z - (X @ fitted[:, :, None])[:, :, 0]
         count = near.sum(axis=1)
-        misfit = (weight * residual**2).sum(axis=1) / np.maximum(count - UNKNOWNS, 1)
+        chi2 = (weight * residual**2).sum(axis=1)
         known = count >= LEAST_NEIGHBOURS
-        variance = covariance[:, 0, 0] * np.maximum(misfit, 1.0) + model.touch_sigma**2
+        # A step must show here, four touches that are off their plane by chance must not: the mean over the touches.
+        steps = np.maximum(chi2 / np.maximum(count - 1, 1), 1.0)
+        variance = covariance[:, 0, 0] * steps + model.touch_sigma**2
         # The estimate is C X'W z: errors of z with covariance W^-1 reach it as C X'WX C = C - C prior C.
         by_slope = covariance[:, 1:, 1:]
         slope_noise = by_slope - (by_slope @ by_slope) / model.slope_sigma**2
-        slope_noise *= np.clip(misfit, LEAST_MISFIT, None)[:, None, None]
+        misfit = chi2 / np.maximum(count - UNKNOWNS, 1)
+        slope_noise *= np.maximum(misfit, LEAST_MISFIT)[:, None, None]
         height = np.where(known, datum + fitted[:, 0], 0.0)
         return SurfacePatches(known, height, fitted[:, 1:], variance, slope_noise)
