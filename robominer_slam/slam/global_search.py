@@ -90,9 +90,10 @@ class GlobalSearch:
         poses, scores = [], []
         for yaw in np.arange(0.0, 2.0 * np.pi, yaw_step):
             score, offset = self._over(points, z, float(yaw), variance, least)
-            kept = min(KEPT_PER_HEADING, score.size)
-            best = np.argpartition(score, score.size - kept)[-kept:]
-            best = best[score[best] > 0.0]
+            # Most of a large map is no place for the patch: to partition those too takes most of the time.
+            best = np.flatnonzero(score > 0.0)
+            if len(best) > KEPT_PER_HEADING:
+                best = best[np.argpartition(score[best], len(best) - KEPT_PER_HEADING)[-KEPT_PER_HEADING:]]
             i, j = np.divmod(best, self._shape[1])
             xy = self._origin + np.column_stack([i, j]) * self._cell
             poses.append(np.column_stack([xy, np.full(len(best), yaw), offset[best]]))
