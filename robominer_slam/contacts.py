@@ -60,24 +60,26 @@ class ContactModel:
         self._layout = layout
         self._min = min_inclination
         self._max = max_inclination
-        # Axes of the mounts times the rods' lengths, shape (3 axes, n, 3): where a rod's own axes take its tip.
-        self._reach = np.ascontiguousarray((layout.length[:, None, None] * layout.R_base_whisker).transpose(2, 0, 1))
+        # Axes of the mounts times the rods' lengths, shape (3 axes, 3, n): numpy goes along whiskers fastest.
+        self._reach = np.ascontiguousarray((layout.length[:, None, None] * layout.R_base_whisker).transpose(2, 1, 0))
+        self._p_base = np.ascontiguousarray(layout.p_base.T)
 
     def tips(self, inclination: FloatArray, azimuth: FloatArray) -> FloatArray:
         """Tips of all whiskers in base_link, shape (n, 3), m, from angles of shape (n,), rad."""
-        return self._tips(inclination, azimuth, self._reach, self._layout.p_base)
-
-    @staticmethod
-    def _tips(inclination: FloatArray, azimuth: FloatArray, reach: FloatArray, p_base: FloatArray) -> FloatArray:
-        sine, cosine = np.sin(inclination)[:, None], np.cos(inclination)[:, None]
-        tips: FloatArray = (
-            p_base + sine * (np.cos(azimuth)[:, None] * reach[0] + np.sin(azimuth)[:, None] * reach[1])
-        ) + cosine * reach[2]
-        return tips
+        return _tips(inclination, azimuth, self._reach, self._p_base)
 
     def contacts(self, inclination: FloatArray, azimuth: FloatArray, valid: NDArray[np.bool_]) -> Contacts:
         """Contact points of a frame; arrays of shape (n,), `valid` False for whiskers that say nothing."""
         touching = valid & self._layout.present & (inclination >= self._min) & (inclination <= self._max)
         (index,) = touching.nonzero()
         phi, a = inclination[index], azimuth[index]
-        return Contacts(self._tips(phi, a, self._reach[:, index], self._layout.p_base[index]), index, phi, a)
+        points = _tips(phi, a, self._reach.take(index, axis=2), self._p_base.take(index, axis=1))
+        return Contacts(points, index, phi, a)
+
+
+def _tips(inclination: FloatArray, azimuth: FloatArray, reach: FloatArray, p_base: FloatArray) -> FloatArray:
+    sine = np.sin(inclination)
+    tips = p_base + sine * np.cos(azimuth) * reach[0]
+    tips += sine * np.sin(azimuth) * reach[1]
+    tips += np.cos(inclination) * reach[2]
+    return np.ascontiguousarray(tips.T)

@@ -199,13 +199,13 @@ class WhiskerHealth:
             turned = ~weak & (along < math.cos(math.radians(limits.greatest_turn_deg)) * np.sqrt(square))
         against = self._bends_against(position[-1], azimuth, low, turned)
         found[fitted & (turned | against)] = WhiskerState.FLIPPED
-        second = field[2:] - field[1:-1]
-        second -= field[1:-1] - field[:-2]
+        first = field[1:] - field[:-1]
+        second = first[1:] - first[:-1]
         # The median of |second difference| of white noise is 0.6745 sqrt(6) sigma; more than half above: noisy.
-        high = np.abs(second) > 0.6745 * math.sqrt(6.0) * limits.noise
+        high = np.abs(second, out=second) > 0.6745 * math.sqrt(6.0) * limits.noise
         noisy = 2 * np.add.reduce(high.reshape(-1, high.shape[-1]), dtype=np.intp) > 3 * len(second)
         # All at once is the ground or a knock, not the sensors.
-        if noisy.any() and 3 * np.count_nonzero(noisy) <= np.count_nonzero(self._layout.present):
+        if np.count_nonzero(noisy) and 3 * np.count_nonzero(noisy) <= np.count_nonzero(self._layout.present):
             found[noisy] = WhiskerState.NOISY
         if field.max() >= limits.saturation or field.min() <= -limits.saturation:
             at_end = (np.abs(field) >= limits.saturation).any(axis=1)

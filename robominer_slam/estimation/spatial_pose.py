@@ -15,6 +15,7 @@ FloatArray = NDArray[np.float64]
 
 #: Rows of a twist (translation first) that the planar filter knows.
 PLANAR = [0, 1, 5]
+IN_PLANE = np.ix_(PLANAR, PLANAR)
 
 
 class SpatialPose:
@@ -78,8 +79,7 @@ class SpatialPose:
         driven = self.way if way is None else way
         tilt = math.radians(settings.sigma_tilt_deg) ** 2
         covariance = np.zeros((6, 6))
-        covariance[:2, :2] = planar[:2, :2]
-        covariance[:2, 5], covariance[5, :2], covariance[5, 5] = planar[:2, 2], planar[2, :2], planar[2, 2]
+        covariance[IN_PLANE] = planar
         climbed = 0.0 if self._tilt is None else tilt * driven * driven
         covariance[2, 2] = settings.height_walk**2 * (driven + 0.01) + climbed
         covariance[3, 3] = covariance[4, 4] = tilt
@@ -113,11 +113,11 @@ class SpatialPose:
 def _pose(planar: FloatArray, z: float, tilt: FloatArray) -> FloatArray:
     x, y, yaw = planar.tolist()
     c, s = math.cos(yaw), math.sin(yaw)
-    ahead, left, up = tilt.tolist()
+    (ax, ay, az), (bx, by, bz), up = tilt.tolist()
     return np.array(
         [
-            [*(c * a - s * b for a, b in zip(ahead, left, strict=True)), x],
-            [*(s * a + c * b for a, b in zip(ahead, left, strict=True)), y],
+            [c * ax - s * bx, c * ay - s * by, c * az - s * bz, x],
+            [s * ax + c * bx, s * ay + c * by, s * az + c * bz, y],
             [*up, z],
             [0.0, 0.0, 0.0, 1.0],
         ]
