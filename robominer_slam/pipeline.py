@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -15,7 +14,7 @@ from drivers.measurement import HallFrame, ImuSample, Measurement
 from drivers.spherical import cartesian_frame
 from robominer_slam import geometry
 from robominer_slam.contacts import ContactModel, at_frame_start
-from robominer_slam.estimation.attitude_increments import AttitudeIncrements
+from robominer_slam.estimation.imu_mounts import ImuMounts
 from robominer_slam.estimation.odometry_state import (
     DeadReckoning,
     FeelsMotion,
@@ -87,7 +86,7 @@ class Pipeline:
         self._takes_matches = dead_reckoning if isinstance(dead_reckoning, TakesScanMatches) else None
         self._contact_model = contact_model
         self._composite = composite_scan
-        self._imu_mounts = imu_mounts
+        self._imu_mounts = ImuMounts(imu_mounts)
         self._scan_odometry = scan_odometry
         self._points_down = np.ones(angle_estimator.count, dtype=np.bool_) if points_down is None else points_down
         self.localised = True
@@ -102,7 +101,6 @@ class Pipeline:
         self._contact_ns: int | None = None
         self._odometry_ns: int | None = None
         self._last_frame: HallFrame | None = None
-        self._increments: defaultdict[str, AttitudeIncrements] = defaultdict(AttitudeIncrements)
 
     def add(self, device: str, measurement: Measurement) -> list[FrameResult]:
         """Take a measurement of a device; returns the results of the frames that it releases."""
@@ -160,10 +158,7 @@ class Pipeline:
                     results.append(result)
                 continue
             if isinstance(measurement, ImuSample):
-                if measurement.gyro is None:
-                    measurement = self._increments[device].with_rate(measurement)
-                if device in self._imu_mounts:
-                    measurement = _in_base(self._imu_mounts[device], measurement)
+                measurement = self._imu_mounts.in_base(device, measurement)
             elif self._dead_reckoning.measures_motion(measurement):
                 self._odometry_ns = measurement.stamp_ns
             self._dead_reckoning.add(measurement)
@@ -309,21 +304,6 @@ class Pipeline:
         if self.runner is None or self._contact_ns is None or stamp - self._contact_ns > BLIND_NS or self.paused:
             return "dead_reckoning"
         return "tracking"
-
-
-def _in_base(R: FloatArray, sample: ImuSample) -> ImuSample:
-    """The sample in base_link's axes, of an IMU mounted with the rotation R, shape (3, 3)."""
-    return replace(
-        sample,
-        gyro=None if sample.gyro is None else R @ sample.gyro,
-        acceleration=None if sample.acceleration is None else R @ sample.acceleration,
-        orientation_xyzw=None if sample.orientation_xyzw is None else _turned(sample.orientation_xyzw, R),
-    )
-
-
-def _turned(xyzw: FloatArray, R_base_imu: FloatArray) -> FloatArray:
-    """Attitude of base_link from that of an IMU mounted in it."""
-    return geometry.matrix_to_quaternion(geometry.quaternion_to_matrix(xyzw) @ R_base_imu.T)
 
 
 def planar_pose(state: OdometryState) -> FloatArray:
