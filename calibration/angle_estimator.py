@@ -64,6 +64,7 @@ class AngleEstimator:
         # Directions alone do not tell how strong the neighbours are beside the whisker's own magnet.
         self._neighbours = None if self._direction_only else model.neighbours
         self._added_mT = np.zeros_like(model.rest_mT)
+        self._moved = np.empty_like(model.rest_mT)
         self._earth_mT = None if self._direction_only or model.base_to_sensor is None else earth_mT
         self.out_of_range = 0
 
@@ -92,7 +93,9 @@ class AngleEstimator:
         if self._direction_only:
             raw = raw / np.maximum(np.sqrt(np.square(raw).sum(axis=1, keepdims=True)), 1e-9)
         # A sensor that dropped off its bus reports all zeros (brief: sensor faults seen on the robot).
-        usable = valid.reshape(-1) & model.fitted & raw.any(axis=1)
+        usable = valid.reshape(-1) & model.fitted
+        if np.count_nonzero(raw) < raw.size:
+            usable &= raw.any(axis=1)
         if model.folded:
             usable &= ~near_fold(raw, model.representation)
         field = raw - self._offset_mT
@@ -104,9 +107,10 @@ class AngleEstimator:
         else:
             tilt, inclination = self._without_neighbours(field, usable, self._neighbours)
         in_range = inclination <= self._largest
-        self.out_of_range += int(np.count_nonzero(usable & ~in_range))
+        well = usable & in_range
+        self.out_of_range += int(np.count_nonzero(usable)) - int(np.count_nonzero(well))
         azimuth = np.arctan2(tilt[1], tilt[0])
-        return WhiskerAngles(inclination, azimuth, self._sigma(inclination), usable & in_range)
+        return WhiskerAngles(inclination, azimuth, self._sigma(inclination), well)
 
     def _without_neighbours(
         self, field: FloatArray, usable: NDArray[np.bool_], neighbours: FloatArray
@@ -117,11 +121,11 @@ class AngleEstimator:
             inclination = np.sqrt(tilt[0] * tilt[0] + tilt[1] * tilt[1])
             # A rod's direction less its rest direction; what a dead sensor's rod does, nobody knows.
             bent = np.minimum(inclination, MOST) * usable
-            moved = np.empty((len(usable), 3))
+            moved = self._moved
             moved[:, :2] = (tilt * (np.sin(bent) / np.maximum(inclination, 1e-9))).T
             moved[:, 2] = np.cos(bent) - 1.0
             added = (neighbours @ moved.reshape(-1)).reshape(-1, 3)
-            change = np.abs(added - self._added_mT).max()
+            change = np.maximum.reduce(np.abs(added - self._added_mT), axis=None)
             self._added_mT = added
             if change < NEGLIGIBLE_MT:
                 break

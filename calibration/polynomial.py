@@ -134,37 +134,37 @@ class PolynomialEvaluator:
         strength = np.maximum(np.sqrt(np.square(model.rest_mT).sum(axis=-1)), 1.0)
         self._inverse_strength = 1.0 / strength
         self._coefficients = np.ascontiguousarray(model.coefficients.transpose(2, 1, 0))
-        terms = model.coefficients.shape[1]
-        # A monomial is a product of three powers, taken from a table: numpy's calls cost more than its products.
-        self._powers = np.ones((3, model.degree + 1, n))
-        exponent = _exponents(model.degree)
-        self._power_of = exponent + np.arange(3)[:, None] * (model.degree + 1)
-        self._features, self._factor = np.empty((terms, n)), np.empty((terms, n))
+        # The monomials of a degree are those of the degree below times x, those of them without x times y, and the
+        # last one times z: products of slices, as numpy's calls cost more than its products.
+        self._features = np.ones((model.coefficients.shape[1], n))
+        self._products = _products(self._features, model.degree)
 
     def tilt(self, field_mT: FloatArray) -> FloatArray:
         """Tilt vectors, shape (2, n), rad, of one field reading per whisker, shape (n, 3), mT."""
-        u = field_mT.T * self._polarity
+        # Whiskers last in memory too, not only in shape: the products below run along them.
+        u = np.multiply(field_mT.T, self._polarity, order="C")
         square = u * u
         transverse_square = square[0] + square[1]
         strength = np.sqrt(transverse_square + square[2])
         transverse = np.sqrt(np.maximum(transverse_square, 1e-18))
         u[:2] *= np.arctan2(2.0 * transverse, u[2]) / transverse
         u[2] = strength * self._inverse_strength - 1.0
-        powers, features, factor = self._powers, self._features, self._factor
-        for degree in range(1, self._degree + 1):
-            np.multiply(powers[:, degree - 1], u, out=powers[:, degree])
-        flat = powers.reshape(-1, u.shape[1])
-        # "clip" writes into `out` directly; no index is ever outside.
-        np.take(flat, self._power_of[0], axis=0, out=features, mode="clip")
-        for one in self._power_of[1:]:
-            np.take(flat, one, axis=0, out=factor, mode="clip")
-            np.multiply(features, factor, out=features)
-        tilt: FloatArray = np.einsum("otn,tn->on", self._coefficients, features)
+        for of, variable, product in self._products:
+            np.multiply(of, u[variable], out=product)
+        tilt: FloatArray = np.einsum("otn,tn->on", self._coefficients, self._features)
         return tilt
 
 
-def _exponents(degree: int) -> NDArray[np.intp]:
-    """Exponents of x, y, z of all monomials up to a degree, in the order of `monomials`, shape (3, terms)."""
-    sizes = range(degree + 1)
-    each = [monomial for size in sizes for monomial in combinations_with_replacement(range(3), size)]
-    return np.array([[monomial.count(axis) for monomial in each] for axis in range(3)], dtype=np.intp)
+def _products(features: FloatArray, degree: int) -> list[tuple[FloatArray, int, FloatArray]]:
+    """Views of all monomials, shape (terms, n), in the order of `monomials`: factor, variable, where it goes."""
+    products = []
+    begin, size = 0, 1
+    for d in range(1, degree + 1):
+        end = begin + size
+        at = end
+        # Of degree d - 1, this many do not have x, nor x and y.
+        for variable, count in enumerate((size, d, 1)):
+            products.append((features[end - count : end], variable, features[at : at + count]))
+            at += count
+        begin, size = end, at - end
+    return products

@@ -7,12 +7,13 @@ number through that is not finite.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from drivers import whisker_array
+from drivers import plain_messages, whisker_array
 from drivers.counters import Counters
 from drivers.measurement import (
     SCREW_NAMES,
@@ -28,15 +29,16 @@ from drivers.readings import RADIANS_PER_SECOND_PER_RPM
 from drivers.ros_messages import Message, MessageError, deserialize, header, new, serialize, time_to_ns
 
 WHISKER_ARRAY = whisker_array.TYPENAME
-IMU = "sensor_msgs/msg/Imu"
-JOINT_STATE = "sensor_msgs/msg/JointState"
+IMU = plain_messages.IMU
+JOINT_STATE = plain_messages.JOINT_STATE
 MOTOR_FEEDBACK = "robominer_msgs/msg/MotorModuleFeedback"
-TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
+TWIST_STAMPED = plain_messages.TWIST_STAMPED
 ODOMETRY = "nav_msgs/msg/Odometry"
 
 #: sensor_msgs/Imu: a covariance whose first element is -1 says that the estimate is absent.
 ABSENT = -1.0
 QUATERNION_TOLERANCE = 0.05
+_SCREWS = frozenset(SCREW_NAMES)
 
 
 class NotFiniteError(MessageError):
@@ -95,21 +97,17 @@ def decode(
     return measurement
 
 
-@dataclass(frozen=True, slots=True)
-class _Context:
+class _Context(NamedTuple):
     counters: Counters
     screw: str | None
     sensor_period_ns: int
 
 
-def _finite(values: FloatArray, what: str) -> FloatArray:
-    if not np.isfinite(values).all():
+def _finite(values: Sequence[float], what: str) -> FloatArray:
+    # One by one: numpy takes longer to begin than this takes for a few numbers.
+    if not all(map(math.isfinite, values)):
         raise NotFiniteError(f"{what} is not finite")
-    return values
-
-
-def _vector(message: Message) -> FloatArray:
-    return np.array([message.x, message.y, message.z], dtype=np.float64)
+    return np.array(values, dtype=np.float64)
 
 
 def _new_vector(values: FloatArray) -> Message:
@@ -143,26 +141,27 @@ def _encode_imu(sample: ImuSample, frame_id: str) -> bytes:
 
 
 def _decode_imu(data: bytes, _context: _Context) -> ImuSample:
-    message = deserialize(data, IMU)
+    message = plain_messages.imu(data)
     gyro = acceleration = orientation = None
-    if message.angular_velocity_covariance[0] != ABSENT:
-        gyro = _finite(_vector(message.angular_velocity), "angular velocity")
-    if message.linear_acceleration_covariance[0] != ABSENT:
-        acceleration = _finite(_vector(message.linear_acceleration), "linear acceleration")
-    if message.orientation_covariance[0] != ABSENT:
-        q = message.orientation
-        orientation = _orientation(np.array([q.x, q.y, q.z, q.w], dtype=np.float64))
-    return ImuSample(time_to_ns(message.header.stamp), gyro, acceleration, orientation)
+    of_orientation, of_gyro, of_acceleration = message.covariances
+    if of_gyro != ABSENT:
+        gyro = _finite(message.gyro, "angular velocity")
+    if of_acceleration != ABSENT:
+        acceleration = _finite(message.acceleration, "linear acceleration")
+    if of_orientation != ABSENT:
+        orientation = _orientation(message.orientation)
+    return ImuSample(message.stamp_ns, gyro, acceleration, orientation)
 
 
-def _orientation(xyzw: FloatArray) -> FloatArray | None:
+def _orientation(xyzw: Sequence[float]) -> FloatArray | None:
     """The quaternion; None where it is all zeros, as drivers leave it when they have none yet."""
-    norm = float(np.linalg.norm(_finite(xyzw, "orientation")))
+    quaternion = _finite(xyzw, "orientation")
+    norm = math.hypot(*xyzw)
     if norm == 0.0:
         return None
     if abs(norm - 1.0) > QUATERNION_TOLERANCE:
         raise MessageError(f"orientation of norm {norm:.3f}, expected 1")
-    return xyzw
+    return quaternion
 
 
 def _encode_angles(angles: ScrewAngles, frame_id: str) -> bytes:
@@ -179,17 +178,16 @@ def _encode_angles(angles: ScrewAngles, frame_id: str) -> bytes:
 
 def _decode_joints(data: bytes, _context: _Context) -> ScrewAngles | ScrewSpeeds:
     """Angles where all four screws have a position, else the speeds of those that have a velocity."""
-    message = deserialize(data, JOINT_STATE)
-    names: list[str] = message.name
-    stamp_ns = time_to_ns(message.header.stamp)
-    if len(message.position) == len(names) and set(SCREW_NAMES) <= set(names):
-        angle = np.array([message.position[names.index(name)] for name in SCREW_NAMES], dtype=np.float64)
+    message = plain_messages.joints(data)
+    names, stamp_ns = message.names, message.stamp_ns
+    if len(message.position) == len(names) and _SCREWS.issubset(names):
+        angle = [message.position[names.index(name)] for name in SCREW_NAMES]
         return ScrewAngles(stamp_ns, _finite(angle, "position"))
     speed = np.full(4, np.nan)
     if len(message.velocity) == len(names):
         for k, name in enumerate(SCREW_NAMES):
             if name in names:
-                speed[k] = _finite(message.velocity[names.index(name)], "velocity")
+                (speed[k],) = _finite([message.velocity[names.index(name)]], "velocity")
     if np.isnan(speed).all():
         raise MessageError(f"no position of all screws and no velocity of any of {SCREW_NAMES}")
     return ScrewSpeeds(stamp_ns, speed)
@@ -221,14 +219,13 @@ def _decode_motor(data: bytes, context: _Context) -> ScrewSpeeds:
     message = deserialize(data, MOTOR_FEEDBACK)
     k = _screw_index(message, context.screw)
     speed = np.full(4, np.nan)
-    speed[k] = message.motor_rpm * RADIANS_PER_SECOND_PER_RPM
-    _finite(speed[k], "rpm")
+    (speed[k],) = _finite([message.motor_rpm * RADIANS_PER_SECOND_PER_RPM], "rpm")
     current = voltage = None
     # A module that does not measure leaves both at zero; a powered one never has zero volts.
     if message.motor_voltage_v != 0.0 or message.motor_current_ma != 0.0:
         current, voltage = np.full(4, np.nan), np.full(4, np.nan)
         current[k], voltage[k] = message.motor_current_ma, message.motor_voltage_v
-        _finite(np.array([current[k], voltage[k]]), "current or voltage")
+        _finite([current[k], voltage[k]], "current or voltage")
     return ScrewSpeeds(time_to_ns(message.header.stamp), speed, current, voltage)
 
 
@@ -255,18 +252,15 @@ def _encode_odometry(sample: OdometrySample, frame_id: str) -> bytes:
 
 
 def _decode_twist(data: bytes, _context: _Context) -> OdometrySample:
-    message = deserialize(data, TWIST_STAMPED)
-    return _sample(message.header, message.twist)
+    stamp_ns, (vx, vy, _, _, _, wz) = plain_messages.twist(data)
+    return OdometrySample(stamp_ns, _finite((vx, vy, wz), "velocity"))
 
 
 def _decode_odometry(data: bytes, _context: _Context) -> OdometrySample:
     message = deserialize(data, ODOMETRY)
-    return _sample(message.header, message.twist.twist)
-
-
-def _sample(head: Message, twist: Message) -> OdometrySample:
-    velocity = np.array([twist.linear.x, twist.linear.y, twist.angular.z], dtype=np.float64)
-    return OdometrySample(time_to_ns(head.stamp), _finite(velocity, "velocity"))
+    twist = message.twist.twist
+    velocity = (twist.linear.x, twist.linear.y, twist.angular.z)
+    return OdometrySample(time_to_ns(message.header.stamp), _finite(velocity, "velocity"))
 
 
 _READERS: dict[str, Callable[[bytes, _Context], Measurement]] = {

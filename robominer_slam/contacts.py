@@ -6,7 +6,7 @@ thesis's tip assumption, section 3.1). A whisker that hangs at rest touches noth
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,9 +41,10 @@ def at_frame_start(contacts: Contacts, velocity: FloatArray, sensor_period_ns: i
         return contacts
     later = contacts.index * (sensor_period_ns * 1e-9)
     points = contacts.points.copy()
-    points[:, 0] += later * (velocity[0] - velocity[2] * contacts.points[:, 1])
-    points[:, 1] += later * (velocity[1] + velocity[2] * contacts.points[:, 0])
-    return replace(contacts, points=points)
+    vx, vy, wz = velocity.tolist()
+    points[:, 0] += later * (vx - wz * contacts.points[:, 1])
+    points[:, 1] += later * (vy + wz * contacts.points[:, 0])
+    return Contacts(points, contacts.index, contacts.inclination, contacts.azimuth)
 
 
 class ContactModel:
@@ -59,18 +60,26 @@ class ContactModel:
         self._layout = layout
         self._min = min_inclination
         self._max = max_inclination
+        # Axes of the mounts times the rods' lengths, shape (3 axes, 3, n): numpy goes along whiskers fastest.
+        self._reach = np.ascontiguousarray((layout.length[:, None, None] * layout.R_base_whisker).transpose(2, 1, 0))
+        self._p_base = np.ascontiguousarray(layout.p_base.T)
 
     def tips(self, inclination: FloatArray, azimuth: FloatArray) -> FloatArray:
         """Tips of all whiskers in base_link, shape (n, 3), m, from angles of shape (n,), rad."""
-        sine = np.sin(inclination)
-        direction = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(inclination)], axis=1)
-        layout = self._layout
-        rod = np.matmul(layout.R_base_whisker, direction[:, :, None])[:, :, 0]
-        tips: FloatArray = layout.p_base + layout.length[:, None] * rod
-        return tips
+        return _tips(inclination, azimuth, self._reach, self._p_base)
 
     def contacts(self, inclination: FloatArray, azimuth: FloatArray, valid: NDArray[np.bool_]) -> Contacts:
         """Contact points of a frame; arrays of shape (n,), `valid` False for whiskers that say nothing."""
         touching = valid & self._layout.present & (inclination >= self._min) & (inclination <= self._max)
-        index = np.flatnonzero(touching)
-        return Contacts(self.tips(inclination, azimuth)[index], index, inclination[index], azimuth[index])
+        (index,) = touching.nonzero()
+        phi, a = inclination[index], azimuth[index]
+        points = _tips(phi, a, self._reach.take(index, axis=2), self._p_base.take(index, axis=1))
+        return Contacts(points, index, phi, a)
+
+
+def _tips(inclination: FloatArray, azimuth: FloatArray, reach: FloatArray, p_base: FloatArray) -> FloatArray:
+    sine = np.sin(inclination)
+    tips = p_base + sine * np.cos(azimuth) * reach[0]
+    tips += sine * np.sin(azimuth) * reach[1]
+    tips += np.cos(inclination) * reach[2]
+    return np.ascontiguousarray(tips.T)

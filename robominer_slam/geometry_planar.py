@@ -5,6 +5,8 @@ Vectorised over leading axes. Import these from `robominer_slam.geometry`, which
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -119,7 +121,12 @@ def se2_right_jacobian(twist: ArrayLike) -> FloatArray:
 
 def levelled(T: FloatArray) -> tuple[FloatArray, FloatArray]:
     """A pose as x, y, heading, z, shape (4,), and the tilt R with R_map_base = R_z(heading) R, shape (3, 3)."""
-    yaw = float(np.arctan2(T[1, 0], T[0, 0]))
-    c, s = np.cos(yaw), np.sin(yaw)
-    R_yaw = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return np.array([T[0, 3], T[1, 3], yaw, T[2, 3]]), R_yaw.T @ T[:3, :3]
+    a, b, up, _ = T.tolist()
+    yaw = math.atan2(b[0], a[0])
+    c, s = math.cos(yaw), math.sin(yaw)
+    tilt = [
+        [c * ax + s * bx for ax, bx in zip(a[:3], b[:3], strict=True)],
+        [c * bx - s * ax for ax, bx in zip(a[:3], b[:3], strict=True)],
+        up[:3],
+    ]
+    return np.array([a[3], b[3], yaw, up[3]]), np.array(tilt)

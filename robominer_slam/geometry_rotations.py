@@ -8,6 +8,8 @@ Sources: Sola, Deray, Atchuthan, "A micro Lie theory for state estimation in rob
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -67,8 +69,10 @@ def squared_norm(v: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("...i,...i->...", v, v))
 
 
-def wrap_angle(angle: ArrayLike) -> FloatArray:
+def wrap_angle(angle: ArrayLike | float) -> FloatArray:
     """Angle(s) in (-pi, pi], rad. Those already inside come back unchanged to the bit."""
+    if isinstance(angle, float) and -math.pi < angle < math.pi:
+        return np.asarray(angle, dtype=np.float64)
     a = np.asarray(angle, dtype=np.float64)
     wrapped = a - 2.0 * np.pi * np.rint(a / (2.0 * np.pi))
     return np.where(np.abs(wrapped) >= np.pi, np.pi, wrapped)

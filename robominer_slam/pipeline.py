@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.angle_estimator import AngleEstimator
+from calibration.angle_estimator import AngleEstimator, WhiskerAngles
 from drivers.measurement import HallFrame, ImuSample, Measurement
 from drivers.spherical import cartesian_frame
 from robominer_slam import geometry
 from robominer_slam.contacts import ContactModel, at_frame_start
-from robominer_slam.estimation.attitude_increments import AttitudeIncrements
+from robominer_slam.estimation.imu_mounts import ImuMounts
 from robominer_slam.estimation.odometry_state import (
     DeadReckoning,
     FeelsMotion,
@@ -81,9 +80,13 @@ class Pipeline:
         self.wrong_size_frames = 0
         self.stale_frames = 0
         self._dead_reckoning = dead_reckoning
+        # Asked once: to ask a protocol at runtime takes longer than what it is asked for.
+        self._feels = dead_reckoning if isinstance(dead_reckoning, FeelsMotion) else None
+        self._tells = dead_reckoning if isinstance(dead_reckoning, TellsMotion) else None
+        self._takes_matches = dead_reckoning if isinstance(dead_reckoning, TakesScanMatches) else None
         self._contact_model = contact_model
         self._composite = composite_scan
-        self._imu_mounts = imu_mounts
+        self._imu_mounts = ImuMounts(imu_mounts)
         self._scan_odometry = scan_odometry
         self._points_down = np.ones(angle_estimator.count, dtype=np.bool_) if points_down is None else points_down
         self.localised = True
@@ -98,7 +101,6 @@ class Pipeline:
         self._contact_ns: int | None = None
         self._odometry_ns: int | None = None
         self._last_frame: HallFrame | None = None
-        self._increments: defaultdict[str, AttitudeIncrements] = defaultdict(AttitudeIncrements)
 
     def add(self, device: str, measurement: Measurement) -> list[FrameResult]:
         """Take a measurement of a device; returns the results of the frames that it releases."""
@@ -156,7 +158,7 @@ class Pipeline:
                     results.append(result)
                 continue
             if isinstance(measurement, ImuSample):
-                measurement = self._in_base(device, self._increments[device].with_rate(measurement))
+                measurement = self._imu_mounts.in_base(device, measurement)
             elif self._dead_reckoning.measures_motion(measurement):
                 self._odometry_ns = measurement.stamp_ns
             self._dead_reckoning.add(measurement)
@@ -179,13 +181,13 @@ class Pipeline:
         angles = self.angle_estimator.angles(frame.field_mT, frame.valid)
         odometry = self._dead_reckoning.state_at(stamp)
         well, may_touch = self.monitor.judge(frame, angles, odometry, self.angle_estimator)
-        angles = replace(angles, valid=well)
+        angles = WhiskerAngles(angles.inclination, angles.azimuth, angles.sigma, well)
         contacts = self._contact_model.contacts(angles.inclination, angles.azimuth, may_touch)
         contacts = at_frame_start(contacts, odometry.velocity, frame.sensor_period_ns)
         if len(contacts.index):
             self._contact_ns = stamp
-        if isinstance(self._dead_reckoning, FeelsMotion):
-            self._dead_reckoning.add_contacts(stamp, contacts)
+        if self._feels is not None:
+            self._feels.add_contacts(stamp, contacts)
             odometry = self._dead_reckoning.state_at(stamp)
         floor = self._points_down[contacts.index]
         odometry = self._matched(stamp, odometry, contacts.points[floor])
@@ -212,8 +214,8 @@ class Pipeline:
 
     def _matched(self, stamp: int, odometry: OdometryState, points: FloatArray) -> OdometryState:
         """The odometry after matching the scan with the ground touched lately."""
-        scans, reckoning = self._scan_odometry, self._dead_reckoning
-        if scans is None or not isinstance(reckoning, TakesScanMatches):
+        scans, reckoning = self._scan_odometry, self._takes_matches
+        if scans is None or reckoning is None:
             return odometry
         level, tilt = geometry.levelled(planar_pose(odometry))
         points = points @ tilt.T
@@ -223,7 +225,7 @@ class Pipeline:
         correction = scans.match(level, covariance, points)
         if correction is not None:
             reckoning.correct_pose(stamp, correction.offset, correction.information)
-            odometry = reckoning.state_at(stamp)
+            odometry = self._dead_reckoning.state_at(stamp)
             level, _ = geometry.levelled(planar_pose(odometry))
         if scans.breaks > self._breaks:
             self._broken(scans.breaks)
@@ -249,8 +251,8 @@ class Pipeline:
             return None
         keyframe = self._composite.add(stamp, T_odom_base, points, floor)
         if keyframe is not None:
-            if isinstance(self._dead_reckoning, TellsMotion):
-                keyframe = replace(keyframe, motion=self._dead_reckoning.mark_keyframe(stamp))
+            if self._tells is not None:
+                keyframe = replace(keyframe, motion=self._tells.mark_keyframe(stamp))
             if self._scan_odometry is not None:
                 keyframe = replace(keyframe, breaks=self._scan_odometry.breaks)
             if self._prior is not None:
@@ -279,13 +281,16 @@ class Pipeline:
 
         The graph takes its first keyframe as exact; the way to it from the map's origin was odometry's.
         """
-        c, s = self._T_map_odom[0, 0], self._T_map_odom[1, 0]
-        R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        c, s = self._T_map_odom[:2, 0].tolist()
         if self._last_result is None or self._odometry_at_result is None:
+            R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
             covariance: FloatArray = R @ odometry.covariance @ R.T
             return covariance
-        grown = np.maximum(np.diag(odometry.covariance - self._odometry_at_result), 0.0)
-        covariance = self._first_keyframe_covariance + self._last_result.covariance + R @ np.diag(grown) @ R.T
+        grown = (odometry.covariance - self._odometry_at_result).diagonal().tolist()
+        x, y, yaw = (max(variance, 0.0) for variance in grown)
+        xy = c * s * (x - y)
+        turned = np.array([[c * c * x + s * s * y, xy, 0.0], [xy, s * s * x + c * c * y, 0.0], [0.0, 0.0, yaw]])
+        covariance = self._first_keyframe_covariance + self._last_result.covariance + turned
         return covariance
 
     def _state(self, stamp: int) -> LocalizationState:
@@ -299,22 +304,6 @@ class Pipeline:
         if self.runner is None or self._contact_ns is None or stamp - self._contact_ns > BLIND_NS or self.paused:
             return "dead_reckoning"
         return "tracking"
-
-    def _in_base(self, device: str, sample: ImuSample) -> ImuSample:
-        R = self._imu_mounts.get(device)
-        if R is None:
-            return sample
-        return replace(
-            sample,
-            gyro=None if sample.gyro is None else R @ sample.gyro,
-            acceleration=None if sample.acceleration is None else R @ sample.acceleration,
-            orientation_xyzw=None if sample.orientation_xyzw is None else _turned(sample.orientation_xyzw, R),
-        )
-
-
-def _turned(xyzw: FloatArray, R_base_imu: FloatArray) -> FloatArray:
-    """Attitude of base_link from that of an IMU mounted in it."""
-    return geometry.matrix_to_quaternion(geometry.quaternion_to_matrix(xyzw) @ R_base_imu.T)
 
 
 def planar_pose(state: OdometryState) -> FloatArray:

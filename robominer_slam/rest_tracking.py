@@ -53,6 +53,7 @@ class RestTracker:
         self._anchor = np.full((2, n), np.nan)
         # Sums over the episode: tilt, its squares, 1.
         self._sums = np.zeros((5, n))
+        self._terms = np.ones((5, n))
         self._start = np.zeros((2, n))
         self._start_ns: NDArray[np.int64] = np.zeros(n, dtype=np.int64)
         # Tilt and direction of motion, in base_link, of the last steady reading off rest.
@@ -82,21 +83,26 @@ class RestTracker:
             How far each rest position is to be moved, as tilt, shape (2, n), rad, zero for most; None for all zero.
         """
         near = usable & (inclination < GREATEST_BEND)
-        if not near.any() and not self._sums[4].any():
+        if not np.count_nonzero(near) and not np.count_nonzero(self._sums[4]):
             return None
-        tilt = np.stack([inclination * np.cos(azimuth), inclination * np.sin(azimuth)])
+        terms = self._terms
+        tilt = terms[:2]
+        np.multiply(inclination, np.cos(azimuth), out=tilt[0])
+        np.multiply(inclination, np.sin(azimuth), out=tilt[1])
+        np.multiply(tilt, tilt, out=terms[2:4])
         off = tilt - self._anchor
         inside = near & (np.add.reduce(off * off) < math.radians(self._limits.rest_deg) ** 2)
         begin = ~inside
-        self._anchor[:, begin] = np.where(near, tilt, np.nan)[:, begin]
-        self._start[0, begin], self._start[1, begin] = pose[0], pose[1]
+        here = np.array([[pose[0]], [pose[1]]])
+        np.copyto(self._anchor, np.where(near, tilt, np.nan), where=begin)
+        np.copyto(self._start, here, where=begin)
         self._start_ns[begin] = stamp_ns
         self._sums *= inside
-        self._sums += np.concatenate([tilt, tilt * tilt, np.ones((1, len(near)))]) * near
-        way = np.array([[pose[0]], [pose[1]]]) - self._start
+        self._sums += terms * near
+        way = here - self._start
         distance = np.sqrt(np.add.reduce(way * way))
         done = (distance >= self._limits.rest_distance) & (self._sums[4] >= FEWEST_FRAMES)
-        if not done.any():
+        if not np.count_nonzero(done):
             return None
         c, s = math.cos(pose[2]), math.sin(pose[2])
         way = np.stack([c * way[0] + s * way[1], c * way[1] - s * way[0]]) / np.maximum(distance, 1e-9)

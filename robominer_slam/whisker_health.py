@@ -91,7 +91,12 @@ class WhiskerHealth:
         self._inclination = np.zeros((twice, n))
         self._valid = np.zeros((twice, n), dtype=np.bool_)
         self._position = np.zeros((twice, 2))
+        self._twice = [
+            part.reshape(2, limits.window, *part.shape[1:])
+            for part in (self._field, self._inclination, self._valid, self._position)
+        ]
         self._frames = 0
+        self._well: BoolArray = np.ones(n, dtype=np.bool_)
         self._rest_state: NDArray[np.int8] = np.zeros(n, dtype=np.int8)
         self._against = np.zeros(n)
         self._looked_at = np.zeros(2)
@@ -104,12 +109,12 @@ class WhiskerHealth:
     @property
     def well(self) -> BoolArray:
         """Which whiskers can be believed, shape (n,)."""
-        well: BoolArray = self.state == WhiskerState.OK
-        return well
+        return self._well
 
     def states(self) -> dict[int, tuple[WhiskerState, int]]:
         """Whiskers that are not well: index to state and the stamp at which it was found, ns."""
-        return {i: (WhiskerState(int(self.state[i])), int(self.since_ns[i])) for i in self.state.nonzero()[0].tolist()}
+        ill = self.state.nonzero()[0].tolist()
+        return {i: (WhiskerState(int(self.state[i])), int(self.since_ns[i])) for i in ill}
 
     def set_rest_state(self, state: NDArray[np.int8]) -> None:
         """What is known of the rest positions: OK, BENT or DRIFTING of each whisker, shape (n,)."""
@@ -136,12 +141,9 @@ class WhiskerHealth:
         Returns:
             Which whiskers can be believed, shape (n,).
         """
-        window = self._limits.window
-        slot = self._frames % window
-        self._field[slot] = self._field[slot + window] = field_mT.T
-        self._inclination[slot] = self._inclination[slot + window] = inclination
-        self._valid[slot] = self._valid[slot + window] = valid
-        self._position[slot] = self._position[slot + window] = position
+        slot = self._frames % self._limits.window
+        for part, value in zip(self._twice, (field_mT.T, inclination, valid, position), strict=True):
+            part[:, slot] = value
         self._frames += 1
         if self._frames % self._limits.every == 0:
             self._look(stamp_ns, azimuth)
@@ -169,6 +171,7 @@ class WhiskerHealth:
         changed |= ~bad & (self.state != WhiskerState.OK) & (stamp_ns - self._seen_ns > limits.recovery * 1e9)
         self.since_ns[changed] = stamp_ns
         self.state[changed] = found[changed]
+        self._well = self.state == WhiskerState.OK
 
     def _from_window(
         self,
@@ -196,13 +199,13 @@ class WhiskerHealth:
             turned = ~weak & (along < math.cos(math.radians(limits.greatest_turn_deg)) * np.sqrt(square))
         against = self._bends_against(position[-1], azimuth, low, turned)
         found[fitted & (turned | against)] = WhiskerState.FLIPPED
-        second = field[2:] - field[1:-1]
-        second -= field[1:-1] - field[:-2]
+        first = field[1:] - field[:-1]
+        second = first[1:] - first[:-1]
         # The median of |second difference| of white noise is 0.6745 sqrt(6) sigma; more than half above: noisy.
-        high = np.abs(second) > 0.6745 * math.sqrt(6.0) * limits.noise
+        high = np.abs(second, out=second) > 0.6745 * math.sqrt(6.0) * limits.noise
         noisy = 2 * np.add.reduce(high.reshape(-1, high.shape[-1]), dtype=np.intp) > 3 * len(second)
         # All at once is the ground or a knock, not the sensors.
-        if noisy.any() and 3 * np.count_nonzero(noisy) <= np.count_nonzero(self._layout.present):
+        if np.count_nonzero(noisy) and 3 * np.count_nonzero(noisy) <= np.count_nonzero(self._layout.present):
             found[noisy] = WhiskerState.NOISY
         if field.max() >= limits.saturation or field.min() <= -limits.saturation:
             at_end = (np.abs(field) >= limits.saturation).any(axis=1)

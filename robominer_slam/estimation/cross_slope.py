@@ -32,7 +32,7 @@ class CrossSlope:
         np.fill_diagonal(distance, np.inf)
         self._neighbours = np.argsort(distance, axis=1)[:, :NEIGHBOURS]
         self._tips = np.empty((3, layout.count))
-        self._usable = floor
+        self._unusable = np.flatnonzero(~floor)
 
     def gradient(self, tips: FloatArray, index: NDArray[np.intp]) -> FloatArray:
         """Slope of the ground along x and y at each tip, shape (2, m); zero where too few neighbours touch.
@@ -44,16 +44,21 @@ class CrossSlope:
         everyone = self._tips
         everyone.fill(np.nan)
         everyone[:, index] = tips.T
-        everyone[:, ~self._usable] = np.nan
+        if len(self._unusable):
+            everyone[:, self._unusable] = np.nan
         dx, dy, dz = everyone[:, self._neighbours[index]] - tips.T[:, :, None]
         weight = 1.0 / (dx * dx + dy * dy + NEAR**2)
-        known = dz == dz
-        weight, dx, dy, dz = (np.where(known, part, 0.0) for part in (weight, dx, dy, dz))
+        unknown = dz != dz
+        if np.count_nonzero(unknown):
+            for part in (weight, dx, dy, dz):
+                part[unknown] = 0.0
         wx, wy = weight * dx, weight * dy
         xx, xy, yy = (wx * dx).sum(axis=1), (wx * dy).sum(axis=1), (wy * dy).sum(axis=1)
         xz, yz = (wx * dz).sum(axis=1), (wy * dz).sum(axis=1)
         xx += FLATNESS / NEAR**2
         yy += FLATNESS / NEAR**2
         determinant = xx * yy - xy * xy
-        slopes: FloatArray = np.stack([yy * xz - xy * yz, xx * yz - xy * xz]) / determinant
+        slopes = np.empty((2, len(index)))
+        np.divide(yy * xz - xy * yz, determinant, out=slopes[0])
+        np.divide(xx * yz - xy * xz, determinant, out=slopes[1])
         return slopes

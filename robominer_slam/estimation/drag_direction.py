@@ -59,6 +59,7 @@ METRIC = np.array([1.0, 1.0, ARM])
 SAME_DIRECTION = 0.9
 #: Way over which the shown direction is averaged, m.
 SHOWN_LENGTH = 1.0
+EYE = np.eye(3)
 
 
 class DragDirection:
@@ -114,7 +115,8 @@ class DragDirection:
         before, self._last_ns = self._last_ns, stamp_ns
         if before is None:
             return None
-        speed = math.hypot(velocity[0], velocity[1]) + ARM * abs(velocity[2])
+        vx, vy, wz = velocity.tolist()
+        speed = math.hypot(vx, vy) + ARM * abs(wz)
         self._way += speed * (stamp_ns - before) * 1e-9
         if self._way < settings.drag_spacing:
             return None
@@ -142,7 +144,7 @@ class DragDirection:
             return None
         discount = min(1.0, way / (2.0 * settings.drag_length))
         self._learn_slide(found, covariance, discount)
-        shared = np.linalg.inv(np.eye(3) + found.information @ self._common(velocity)) * discount
+        shared = np.linalg.inv(EYE + found.information @ self._common(velocity)) * discount
         information = shared @ found.information
         return DragInformation(0.5 * (information + information.T), shared @ found.vector, found.tips, at[:2] / speed)
 
@@ -186,7 +188,7 @@ class DragDirection:
     @staticmethod
     def _shown(found: FrameInformation, velocity: FloatArray, covariance: FloatArray) -> FloatArray:
         """Direction of the motion as this frame shows it: scaled (vx, vy, wz) of length one."""
-        correction = np.linalg.solve(np.eye(3) + covariance @ found.information, covariance @ found.vector)
+        correction = np.linalg.solve(EYE + covariance @ found.information, covariance @ found.vector)
         scaled = (velocity + correction) * METRIC
         direction: FloatArray = scaled / max(math.sqrt(scaled @ scaled), 1e-9)
         return direction
@@ -204,7 +206,10 @@ class DragDirection:
         sx, sy = swept - tips.turning
         steady = np.maximum(np.sqrt(sx**2 + sy**2), self._settings.drag_least_speed)
         sx, sy = sx / steady, sy / steady
-        rows = np.stack([-sy, sx, sx * tips.p[0] + sy * tips.p[1]])
+        rows = np.empty((3, len(sx)))
+        np.negative(sy, out=rows[0])
+        rows[1] = sx
+        np.add(sx * tips.p[0], sy * tips.p[1], out=rows[2])
         sigma2 = self._sigma2 * (1.0 + (cross / DOUBTFUL_SLOPE) ** 2)
         # Student's t with four degrees of freedom: a tip at a steep side counts little.
         weight = 5.0 / ((4.0 * sigma2 + angle**2) * speed**2)
@@ -213,15 +218,17 @@ class DragDirection:
     def _common(self, velocity: FloatArray) -> FloatArray:
         """Covariance of the velocity that the array says, of what its tips have in common, shape (3, 3)."""
         settings = self._settings
-        speed = math.hypot(velocity[0], velocity[1])
+        vx, vy, wz = velocity.tolist()
+        speed = math.hypot(vx, vy)
         # What turning adds lasts longer than the rest: it counts as if it did not average out for so long.
         lasting = math.sqrt(max(settings.drag_turn_length / settings.drag_length, 1.0))
-        turn = settings.drag_turn_share * abs(velocity[2]) * lasting
+        turn = settings.drag_turn_share * abs(wz) * lasting
         side = (math.radians(settings.drag_common_deg) * speed) ** 2 + (turn * ARM) ** 2
         common = np.zeros((3, 3))
         if speed > 1e-9:
-            left = np.array([-velocity[1], velocity[0]]) / speed
-            common[:2, :2] = side * np.outer(left, left)
+            x, y = -vy / speed, vx / speed
+            common[0, 0], common[1, 1] = side * (x * x), side * (y * y)
+            common[0, 1] = common[1, 0] = side * (x * y)
         else:
             common[0, 0] = common[1, 1] = side
         common[2, 2] = turn**2 + (settings.drag_common_curvature * speed) ** 2
@@ -229,8 +236,8 @@ class DragDirection:
 
     def _learn_slide(self, found: FrameInformation, covariance: FloatArray, discount: float) -> None:
         """Estimate `slide` from how the tips of this frame differ; what they have in common is the velocity's."""
-        both = np.column_stack([found.sliding_rows, found.vector])
-        to_velocity = np.linalg.solve(np.eye(3) + covariance @ found.information, covariance @ both)
+        both = np.array([found.sliding_rows, found.vector]).T
+        to_velocity = np.linalg.solve(EYE + covariance @ found.information, covariance @ both)
         shared = found.sliding_rows @ to_velocity
         information = discount * max(found.sliding_sliding - float(shared[0]), 0.0)
         vector = discount * (found.sliding_innovation - float(shared[1]))

@@ -42,7 +42,11 @@ class FrameInformation:
 
 def swept_by(p: FloatArray, turning: FloatArray, velocity: FloatArray) -> FloatArray:
     """Motion of the tips over the ground in base_link's axes, shape (2, m), m/s; arguments as in the module's text."""
-    return np.stack([velocity[0] - velocity[2] * p[1] + turning[0], velocity[1] + velocity[2] * p[0] + turning[1]])
+    vx, vy, wz = velocity.tolist()
+    swept = np.empty_like(p)
+    np.add(vx - wz * p[1], turning[0], out=swept[0])
+    np.add(vy + wz * p[0], turning[1], out=swept[1])
+    return swept
 
 
 @dataclass(frozen=True, slots=True)

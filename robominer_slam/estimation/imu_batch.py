@@ -6,8 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.measurement import ImuSample
+from robominer_slam.estimation.tilt import Vector
 
 FloatArray = NDArray[np.float64]
+
+ZERO: Vector = (0.0, 0.0, 0.0)
 
 #: An IMU that is silent for longer is not one to lean on.
 MAX_GAP_NS = 100_000_000
@@ -24,47 +27,59 @@ class ImuBatch:
     def __init__(self) -> None:
         self.samples = 0
         self.orientation_xyzw: FloatArray | None = None
-        self._integral = np.zeros(3)
-        self._last: FloatArray | None = None
+        self._integral = ZERO
+        self._last: Vector | None = None
         self._sample_ns = self._from_ns = self._until_ns = 0
-        self._acceleration, self._accelerations = np.zeros(3), 0
+        self._acceleration, self._accelerations = ZERO, 0
 
     def add(self, sample: ImuSample) -> None:
         """Take a sample in base_link's axes; stamps ascend."""
         if sample.acceleration is not None:
-            self._acceleration = self._acceleration + sample.acceleration
+            x, y, z = self._acceleration
+            ax, ay, az = sample.acceleration.tolist()
+            self._acceleration = (x + ax, y + ay, z + az)
             self._accelerations += 1
         if sample.orientation_xyzw is not None:
             self.orientation_xyzw = sample.orientation_xyzw
         if sample.gyro is None:
             return
-        stamp = sample.stamp_ns
-        if self._last is None or stamp - self._sample_ns > MAX_GAP_NS:
+        stamp, last = sample.stamp_ns, self._last
+        wx, wy, wz = sample.gyro.tolist()
+        if last is None or stamp - self._sample_ns > MAX_GAP_NS:
             self._from_ns = self._until_ns = stamp
-            self._integral = np.zeros(3)
+            self._integral = ZERO
         elif stamp > self._until_ns:
-            self._integral = self._integral + (self._last + sample.gyro) * (0.5e-9 * (stamp - self._until_ns))
+            x, y, z = self._integral
+            half = 0.5e-9 * (stamp - self._until_ns)
+            self._integral = (x + (last[0] + wx) * half, y + (last[1] + wy) * half, z + (last[2] + wz) * half)
             self._until_ns = stamp
-        self._last, self._sample_ns = sample.gyro, stamp
+        self._last, self._sample_ns = (wx, wy, wz), stamp
         self.samples += 1
 
-    def mean_rate(self, from_ns: int, until_ns: int) -> FloatArray | None:
-        """Mean rate from the last call's end to `until_ns`, rad/s, shape (3,); None if samples do not cover it."""
-        if self._last is None or until_ns - self._sample_ns > MAX_GAP_NS:
+    def mean_rate(self, from_ns: int, until_ns: int) -> Vector | None:
+        """Mean rate from the last call's end to `until_ns`, rad/s; None if samples do not cover it."""
+        last = self._last
+        if last is None or until_ns - self._sample_ns > MAX_GAP_NS:
             return None
+        x, y, z = self._integral
         if until_ns > self._until_ns:
-            self._integral = self._integral + self._last * (1e-9 * (until_ns - self._until_ns))
+            ahead = 1e-9 * (until_ns - self._until_ns)
+            x, y, z = x + last[0] * ahead, y + last[1] * ahead, z + last[2] * ahead
             self._until_ns = until_ns
         span = self._until_ns - self._from_ns
-        rate = self._integral * (1e9 / span) if span > 0 else self._last
+        rate = last
+        if span > 0:
+            per_second = 1e9 / span
+            rate = (x * per_second, y * per_second, z * per_second)
         covered = self._from_ns <= from_ns + MAX_GAP_NS
-        self._from_ns, self._integral, self.samples = self._until_ns, np.zeros(3), 0
+        self._from_ns, self._integral, self.samples = self._until_ns, ZERO, 0
         return rate if covered else None
 
-    def mean_acceleration(self) -> FloatArray | None:
-        """Mean acceleration since the last call, m/s2, shape (3,); None without samples."""
-        if not self._accelerations:
+    def mean_acceleration(self) -> Vector | None:
+        """Mean acceleration since the last call, m/s2; None without samples."""
+        count = self._accelerations
+        if not count:
             return None
-        mean: FloatArray = self._acceleration / self._accelerations
-        self._acceleration, self._accelerations = np.zeros(3), 0
-        return mean
+        x, y, z = self._acceleration
+        self._acceleration, self._accelerations = ZERO, 0
+        return x / count, y / count, z / count

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
@@ -44,15 +45,19 @@ class Inputs:
     level: FloatArray = field(default_factory=lambda: LEVEL)
 
 
-def velocity(state: FloatArray, inputs: Inputs) -> FloatArray:
-    """Body velocity in the interval, shape (3,)."""
-    moving = state[VELOCITY].copy()
+def velocity(state: FloatArray, inputs: Inputs) -> tuple[float, float, float]:
+    """Body velocity vx, vy, wz in the interval."""
+    # Plain floats: numpy takes longer to hand out a number than it takes to compute with it.
+    values = state.tolist()
+    vx, vy, wz = values[VELOCITY]
     if inputs.screws is not None:
-        moving[0] = inputs.screws[0] * (1.0 - state[SLIP_MEAN.start] - state[SLIP.start])
-        moving[1] = inputs.screws[1] * (1.0 - state[SLIP_MEAN.start + 1] - state[SLIP.start + 1])
+        vx, vy = inputs.screws.tolist()
+        mean, varying = SLIP_MEAN.start, SLIP.start
+        vx *= 1.0 - values[mean] - values[varying]
+        vy *= 1.0 - values[mean + 1] - values[varying + 1]
     if inputs.gyro is not None:
-        moving[2] = inputs.gyro - state[GYRO_BIAS]
-    return moving
+        wz = inputs.gyro - values[GYRO_BIAS]
+    return vx, vy, wz
 
 
 def velocity_jacobian(state: FloatArray, inputs: Inputs) -> FloatArray:
@@ -73,12 +78,14 @@ def velocity_jacobian(state: FloatArray, inputs: Inputs) -> FloatArray:
 def motion(state: FloatArray, inputs: Inputs) -> FloatArray:
     """The state after an interval at constant body velocity; midpoint in the heading."""
     later = state.copy()
-    moving = velocity(state, inputs)
-    later[VELOCITY] = moving
+    vx, vy, wz = velocity(state, inputs)
+    later[VELOCITY] = vx, vy, wz
     dt = inputs.dt
-    turn = moving[2] * dt
-    c, s = math.cos(state[YAW] + 0.5 * turn) * dt, math.sin(state[YAW] + 0.5 * turn) * dt
-    ahead, left = inputs.level @ moving[:2]
+    turn = wz * dt
+    middle = float(state[YAW]) + 0.5 * turn
+    c, s = math.cos(middle) * dt, math.sin(middle) * dt
+    (a, b), (d, e) = inputs.level.tolist()
+    ahead, left = a * vx + b * vy, d * vx + e * vy
     later[X] += c * ahead - s * left
     later[Y] += s * ahead + c * left
     later[YAW] += turn
@@ -87,12 +94,12 @@ def motion(state: FloatArray, inputs: Inputs) -> FloatArray:
 
 def motion_jacobian(state: FloatArray, inputs: Inputs) -> tuple[FloatArray, FloatArray]:
     """Derivatives of `motion` by the state, (n, n), and of the pose (x, y, yaw) by the velocity, (3, 3)."""
-    moving = velocity(state, inputs)
+    vx, vy, wz = velocity(state, inputs)
     dt = inputs.dt
-    heading = state[YAW] + 0.5 * moving[2] * dt
+    heading = float(state[YAW]) + 0.5 * wz * dt
     c, s = math.cos(heading) * dt, math.sin(heading) * dt
-    (a, b), (d, e) = inputs.level
-    ahead, left = a * moving[0] + b * moving[1], d * moving[0] + e * moving[1]
+    (a, b), (d, e) = inputs.level.tolist()
+    ahead, left = a * vx + b * vy, d * vx + e * vy
     dx, dy = -s * ahead - c * left, c * ahead - s * left
     D = np.array(
         [
@@ -102,20 +109,23 @@ def motion_jacobian(state: FloatArray, inputs: Inputs) -> tuple[FloatArray, Floa
         ]
     )
     V = velocity_jacobian(state, inputs)
-    F = np.eye(len(state))
+    F = _identity(len(state)).copy()
     F[VELOCITY] = V
-    F[REL] += D @ V
+    F[REL] += D.dot(V)
     F[X, YAW], F[Y, YAW] = dx, dy
     return F, D
 
 
+@cache
+def _identity(n: int) -> FloatArray:
+    return np.eye(n)
+
+
 def compose(state: FloatArray) -> FloatArray:
     """Pose of the levelled base_link in odom (x, y, yaw), shape (3,): keyframe's pose times the pose since."""
-    c, s = math.cos(state[KEY_YAW]), math.sin(state[KEY_YAW])
-    x, y = state[X], state[Y]
-    return np.array(
-        [state[KEY_X] + c * x - s * y, state[KEY_Y] + s * x + c * y, state[KEY_YAW] + state[YAW]]
-    )  # fmt: skip
+    x, y, yaw, _, _, _, key_x, key_y, key_yaw, *_ = state.tolist()
+    c, s = math.cos(key_yaw), math.sin(key_yaw)
+    return np.array([key_x + c * x - s * y, key_y + s * x + c * y, key_yaw + yaw])
 
 
 def given_bias(state: FloatArray, P: FloatArray, bias: slice) -> tuple[FloatArray, FloatArray]:
@@ -134,8 +144,8 @@ def given_bias(state: FloatArray, P: FloatArray, bias: slice) -> tuple[FloatArra
 def compose_jacobian(state: FloatArray) -> FloatArray:
     """Derivative of `compose` by the state, shape (3, n)."""
     J = np.zeros((3, len(state)))
-    c, s = math.cos(state[KEY_YAW]), math.sin(state[KEY_YAW])
-    x, y = state[X], state[Y]
+    x, y, _, _, _, _, _, _, key_yaw, *_ = state.tolist()
+    c, s = math.cos(key_yaw), math.sin(key_yaw)
     J[0, X], J[0, Y], J[1, X], J[1, Y] = c, -s, s, c
     J[0, KEY_X] = J[1, KEY_Y] = J[2, KEY_YAW] = J[2, YAW] = 1.0
     J[0, KEY_YAW], J[1, KEY_YAW] = -s * x - c * y, c * x - s * y
@@ -186,6 +196,7 @@ class PlanarFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has 
         self.outliers = 0
         self._inputs = Inputs(0.0)
         self._fading = 1.0
+        self._effect = np.vstack([np.zeros((3, 3)), np.eye(3)])
 
     def predict_x(self, u: float = 0.0) -> None:  # noqa: ARG002 - filterpy's signature; there is no input
         """Move the state."""
@@ -204,13 +215,13 @@ class PlanarFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has 
         """
         self._inputs, self._fading = inputs, fading
         F, D = motion_jacobian(self.x, inputs)
-        Q = np.zeros_like(self.P)
-        Q.flat[:: len(q) + 1] = q
-        by_velocity = D @ Q_velocity
-        Q[REL, REL] += by_velocity @ D.T
-        Q[REL, VELOCITY] = by_velocity
-        Q[VELOCITY, REL] = by_velocity.T
-        Q[VELOCITY, VELOCITY] += Q_velocity
+        n = len(q)
+        Q = np.zeros((n, n))
+        Q.reshape(-1)[:: n + 1] = q
+        # What the velocity's noise does to the pose and to the velocity itself; `dot` takes half of what `@` does.
+        effect = self._effect
+        effect[REL] = D
+        Q[:KEY_X, :KEY_X] += effect.dot(Q_velocity).dot(effect.T)
         if fading < 1.0:
             F[SLIP, SLIP] *= fading
         self.F, self.Q = F, Q

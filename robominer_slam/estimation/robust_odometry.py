@@ -29,9 +29,6 @@ from robominer_slam.estimation.planar_motion import (
     REL,
     SLIP,
     VELOCITY,
-    VX,
-    VY,
-    WZ,
     Inputs,
     PlanarFilter,
     X,
@@ -94,6 +91,7 @@ class RobustOdometry:
         self._odometry_ns: int | None = None
         self._screws_ns: int | None = None
         self._input, self._Q_input = np.zeros(2), np.zeros((2, 2))
+        self._Q_still = settings.sigma_still**2 * np.eye(2)
         self._state: OdometryState | None = None
         self._stale = 0
 
@@ -143,13 +141,14 @@ class RobustOdometry:
             return self._state
         x, P = self._filter.x, self._filter.P
         pose = compose(x)
+        x_odom, y_odom, yaw_odom = pose.tolist()
         J = compose_jacobian(x)
         covariance = J @ P @ J.T
         self._state = OdometryState(
             stamp_ns,
-            float(pose[0]),
-            float(pose[1]),
-            float(pose[2]),
+            x_odom,
+            y_odom,
+            yaw_odom,
             x[VELOCITY].copy(),
             covariance,
             P[VELOCITY, VELOCITY].copy(),
@@ -221,23 +220,24 @@ class RobustOdometry:
         before, self._screws_ns = self._screws_ns, stamp_ns
         settings, comparison = self._settings, self._comparison
         screws = self._screw_matrix @ speed
-        if math.hypot(screws[0], screws[1]) > settings.fastest:
+        vx, vy, wz, slip = screws.tolist()
+        if math.hypot(vx, vy) > settings.fastest:
             self._stale += 1
             return
-        still = float(np.abs(speed).max()) < settings.still_screw_speed
+        still = max(map(abs, speed.tolist())) < settings.still_screw_speed
         self._input = screws[:2]
         if still:
-            self._Q_input = settings.sigma_still**2 * np.eye(2)
+            self._Q_input = self._Q_still
         else:
-            doubt = (settings.slip_mode_weight * screws[3]) ** 2
-            self._Q_input = self._R_screws[:2, :2] * self._distrust + doubt * np.eye(2)
+            self._Q_input = self._R_screws[:2, :2] * self._distrust
+            self._Q_input.flat[::3] += (settings.slip_mode_weight * slip) ** 2
         self._predict(stamp_ns)
         if before is None:
             return
         if not comparison.running:
             # Without a gyro, the screws are all that says how fast the body turns.
-            self._filter.correct(*comparison.screws_alone(self._filter.x, float(screws[2]), still, settings))
-        elif comparison.add_screws(float(screws[2]) * (stamp_ns - before) * 1e-9, still):
+            self._filter.correct(*comparison.screws_alone(self._filter.x, wz, still, settings))
+        elif comparison.add_screws(wz * (stamp_ns - before) * 1e-9, still):
             distance = self._filter.correct(*comparison.measurement(self._filter.x))
             self._distrust = max(1.0, distance / DISAGREEMENT)
             comparison.start(running=True)
@@ -252,7 +252,8 @@ class RobustOdometry:
         dt = (stamp_ns - previous) * 1e-9
         x = ekf.x
         q = np.zeros(len(x))
-        way = math.hypot(x[VX], x[VY]) * dt
+        vx, vy, wz = x[VELOCITY].tolist()
+        way = math.hypot(vx, vy) * dt
         q[X] = q[Y] = settings.position_walk**2 * way
         q[self._match] = self._match_variance * (2.0 * way / settings.match_length)
         walk = settings.acceleration_walk**2 * dt
@@ -267,7 +268,7 @@ class RobustOdometry:
                 screws = self._input
                 Q_velocity[:2, :2] = self._Q_input
             q[GYRO_BIAS] = settings.gyro_bias_walk**2 * dt
-            turned = way + abs(float(x[WZ])) * dt * settings.slip_turn_arm
+            turned = way + abs(wz) * dt * settings.slip_turn_arm
             kept = math.exp(-turned / settings.slip_length)
             q[SLIP] = settings.sigma_slip**2 * (1.0 - kept * kept)
         else:

@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 
 from robominer_slam.configuration.robust_estimation_section import RobustEstimationSection
 from robominer_slam.estimation.imu_batch import ImuBatch
-from robominer_slam.estimation.tilt import Tilt, cross
+from robominer_slam.estimation.tilt import Tilt, Vector
 
 FloatArray = NDArray[np.float64]
 
 #: Rows of a twist (translation first) that the planar filter knows.
 PLANAR = [0, 1, 5]
+IN_PLANE = np.ix_(PLANAR, PLANAR)
 
 
 class SpatialPose:
@@ -33,17 +34,17 @@ class SpatialPose:
     def __init__(self, settings: RobustEstimationSection, tilts: bool) -> None:
         self._settings = settings
         self._tilt = Tilt(settings.tilt_time_constant) if tilts else None
-        self._velocity = np.zeros(3)
+        self._velocity = (0.0, 0.0)
         self.rotation = np.eye(3)
         self.z = self.way = 0.0
         self._key = (self.rotation, self.z, self.way)
 
-    def turn(self, imu: ImuBatch, rate: FloatArray | None, velocity: FloatArray, dt: float) -> float | None:
+    def turn(self, imu: ImuBatch, rate: Vector | None, velocity: FloatArray, dt: float) -> float | None:
         """Go on with the IMU's samples of an interval.
 
         Args:
             imu: the samples; its accelerations are taken.
-            rate: mean of the gyro, rad/s, shape (3,); None without one.
+            rate: mean of the gyro, rad/s; None without one.
             velocity: vx, vy (m/s), wz (rad/s), shape (3,).
             dt: length of the interval, s.
 
@@ -53,17 +54,20 @@ class SpatialPose:
         acceleration, tilt = imu.mean_acceleration(), self._tilt
         if tilt is None or (rate is None and acceleration is None):
             return None
-        now = np.array([velocity[0], velocity[1], 0.0])
-        own = (now - self._velocity) / dt + cross(np.array([0.0, 0.0, velocity[2]]), now)
-        self._velocity = now
+        vx, vy, wz = velocity.tolist()
+        before_x, before_y = self._velocity
+        own = ((vx - before_x) / dt - wz * vy, (vy - before_y) / dt + wz * vx, 0.0)
+        self._velocity = (vx, vy)
         tilt.move(dt, rate, acceleration, own, imu.orientation_xyzw)
         self.rotation = tilt.rotation()
         return None if rate is None else tilt.turn_rate(rate)
 
     def advance(self, velocity: FloatArray, dt: float) -> None:
         """Go on by the body velocity (vx, vy, wz)."""
-        self.way += math.hypot(velocity[0], velocity[1]) * dt
-        self.z += float(self.rotation[2, 0] * velocity[0] + self.rotation[2, 1] * velocity[1]) * dt
+        vx, vy, _ = velocity.tolist()
+        up_x, up_y, _ = self.rotation[2].tolist()
+        self.way += math.hypot(vx, vy) * dt
+        self.z += (up_x * vx + up_y * vy) * dt
 
     def pose(self, planar: FloatArray) -> FloatArray | None:
         """Pose of base_link in odom, shape (4, 4), at (x, y, yaw); None for a level body."""
@@ -75,8 +79,7 @@ class SpatialPose:
         driven = self.way if way is None else way
         tilt = math.radians(settings.sigma_tilt_deg) ** 2
         covariance = np.zeros((6, 6))
-        covariance[:2, :2] = planar[:2, :2]
-        covariance[:2, 5], covariance[5, :2], covariance[5, 5] = planar[:2, 2], planar[2, :2], planar[2, 2]
+        covariance[IN_PLANE] = planar
         climbed = 0.0 if self._tilt is None else tilt * driven * driven
         covariance[2, 2] = settings.height_walk**2 * (driven + 0.01) + climbed
         covariance[3, 3] = covariance[4, 4] = tilt
@@ -108,9 +111,14 @@ class SpatialPose:
 
 
 def _pose(planar: FloatArray, z: float, tilt: FloatArray) -> FloatArray:
-    c, s = math.cos(planar[2]), math.sin(planar[2])
-    T = np.eye(4)
-    T[:2, :3] = np.array([[c, -s], [s, c]]) @ tilt[:2]
-    T[2, :3] = tilt[2]
-    T[:3, 3] = planar[0], planar[1], z
-    return T
+    x, y, yaw = planar.tolist()
+    c, s = math.cos(yaw), math.sin(yaw)
+    (ax, ay, az), (bx, by, bz), up = tilt.tolist()
+    return np.array(
+        [
+            [c * ax - s * bx, c * ay - s * by, c * az - s * bz, x],
+            [s * ax + c * bx, s * ay + c * by, s * az + c * bz, y],
+            [*up, z],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
