@@ -22,8 +22,6 @@ FloatArray = NDArray[np.float64]
 WINDOW_S = 0.2
 #: More slip than this is a robot that is stuck: the model ends there.
 MAX_SLIP = 0.9
-#: Ten intervals of 0.02 s add up to a little less than 0.2 s.
-ROUNDING_S = 1e-6
 SLIP_MEAN_TURN, SLIP_TURN = SLIP_MEAN.stop - 1, SLIP.stop - 1
 
 
@@ -88,7 +86,7 @@ class TurnComparison:
         self._screws += angle
         self._readings += 1
         self._still = self._still and still
-        return self._span >= WINDOW_S - ROUNDING_S
+        return self._span >= WINDOW_S
 
     def measurement(self, state: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Innovation (1,), its derivative by the state (1, n) and its covariance (1, 1)."""
