@@ -26,6 +26,8 @@ LEVEL = np.eye(2)
 REL, VELOCITY, KEY = slice(X, VX), slice(VX, KEY_X), slice(KEY_X, SLOW)
 #: Slow states with gyro and screws: bias of the gyro, slip (mean and varying part) of vx, vy, wz.
 GYRO_BIAS, SLIP_MEAN, SLIP = SLOW, slice(SLOW + 1, SLOW + 4), slice(SLOW + 4, SLOW + 7)
+#: Last of the slow states with gyro and screws: heading in odom at the start of a window, see `turn_comparison`.
+WINDOW_YAW = SLIP.stop
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,6 +260,14 @@ class PlanarFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has 
         self.x = self.x + gain @ innovation
         self.P = left @ self.P @ left.T + gain @ R @ gain.T
         return distance
+
+    def begin_window(self) -> None:
+        """Keep the present heading in odom as the window's."""
+        T = np.eye(len(self.x))
+        T[WINDOW_YAW] = 0.0
+        T[WINDOW_YAW, [YAW, KEY_YAW]] = 1.0
+        self.x = T @ self.x
+        self.P = T @ self.P @ T.T
 
     def keyframe(self) -> None:
         """Make the present pose the keyframe's: the pose since becomes zero and is known."""

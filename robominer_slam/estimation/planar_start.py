@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robominer_slam.configuration.robust_estimation_section import RobustEstimationSection
-from robominer_slam.estimation.planar_motion import GYRO_BIAS, SLIP, SLIP_MEAN, SLOW, VELOCITY
+from robominer_slam.estimation.planar_motion import GYRO_BIAS, SLIP, SLIP_MEAN, SLOW, VELOCITY, WINDOW_YAW
 
 FloatArray = NDArray[np.float64]
 
@@ -20,7 +20,7 @@ SIGMA_START = 0.01
 
 def fused(settings: RobustEstimationSection) -> tuple[FloatArray, FloatArray]:
     """State and variances with gyro and screws, shape (n,) each."""
-    x, variance = _start(settings, SLIP.stop)
+    x, variance = _start(settings, WINDOW_YAW + 1)
     variance[GYRO_BIAS] = settings.sigma_gyro_bias**2
     variance[SLIP_MEAN] = settings.sigma_slip_mean**2
     variance[SLIP] = settings.sigma_slip**2

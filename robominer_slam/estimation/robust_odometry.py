@@ -285,10 +285,11 @@ class RobustOdometry:
         if gyro is None:
             comparison.start(running=False)
             return None
-        variance = self._settings.sigma_gyro**2 / samples
-        Q_velocity[2, 2] = variance
+        Q_velocity[2, 2] = self._settings.sigma_gyro**2 / samples
         if not comparison.running:
             comparison.start(running=True)
         else:
-            comparison.add_gyro(gyro * dt, variance * dt * dt, dt)
+            if comparison.begins:
+                self._filter.begin_window()
+            comparison.add_gyro(dt)
         return gyro

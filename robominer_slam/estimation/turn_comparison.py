@@ -2,6 +2,10 @@
 
 Slip takes a share of what the screws turn, so on straight drives, where there is nothing to take a share of, they show
 the gyro's bias; screws that stand show it best.
+
+What the gyro says is the filter's own heading, less that at the window's start, which is a state (a clone: Roumeliotis
+and Burdick, "Stochastic cloning", 2002): the gyro's noise is in the heading's covariance already. As noise of a
+measurement of the bias alone it would count twice, and the covariance of the heading be far too large.
 """
 
 from __future__ import annotations
@@ -10,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robominer_slam.configuration.robust_estimation_section import RobustEstimationSection
-from robominer_slam.estimation.planar_motion import GYRO_BIAS, SLIP, SLIP_MEAN, WZ
+from robominer_slam.estimation.planar_motion import KEY_YAW, SLIP, SLIP_MEAN, WINDOW_YAW, WZ, YAW
 
 FloatArray = NDArray[np.float64]
 
@@ -21,23 +25,35 @@ MAX_SLIP = 0.9
 SLIP_MEAN_TURN, SLIP_TURN = SLIP_MEAN.stop - 1, SLIP.stop - 1
 
 
-def screw_turn(state: FloatArray, gyro_angle: float, span: float) -> FloatArray:
-    """Angle by which the screws seem to turn the body while the gyro reads `gyro_angle`, rad, shape (1,)."""
+def turned(state: FloatArray) -> float:
+    """Angle that the body has turned by since the window's start, rad."""
+    return float(state[KEY_YAW] + state[YAW] - state[WINDOW_YAW])
+
+
+def turned_jacobian(state: FloatArray) -> FloatArray:
+    """Derivative of `turned` by the state, shape (1, n)."""
+    H = np.zeros((1, len(state)))
+    H[0, KEY_YAW] = H[0, YAW] = 1.0
+    H[0, WINDOW_YAW] = -1.0
+    return H
+
+
+def screw_turn(state: FloatArray) -> FloatArray:
+    """Angle by which the screws seem to turn the body in the window, rad, shape (1,)."""
     grip = max(1.0 - state[SLIP_MEAN_TURN] - state[SLIP_TURN], 1.0 - MAX_SLIP)
-    return np.array([(gyro_angle - state[GYRO_BIAS] * span) / grip])
+    return np.array([turned(state) / grip])
 
 
-def screw_turn_jacobian(state: FloatArray, gyro_angle: float, span: float) -> FloatArray:
+def screw_turn_jacobian(state: FloatArray) -> FloatArray:
     """Derivative of `screw_turn` by the state, shape (1, n)."""
     grip = max(1.0 - state[SLIP_MEAN_TURN] - state[SLIP_TURN], 1.0 - MAX_SLIP)
-    H = np.zeros((1, len(state)))
-    H[0, GYRO_BIAS] = -span / grip
-    H[0, SLIP_MEAN_TURN] = H[0, SLIP_TURN] = (gyro_angle - state[GYRO_BIAS] * span) / grip**2
+    H: FloatArray = turned_jacobian(state) / grip
+    H[0, SLIP_MEAN_TURN] = H[0, SLIP_TURN] = turned(state) / grip**2
     return H
 
 
 class TurnComparison:
-    """Sums both angles; every window gives a measurement.
+    """Sums what the screws turn; every window gives a measurement.
 
     Args:
         sigma_still: creep of a robot whose screws stand, rad/s.
@@ -53,13 +69,16 @@ class TurnComparison:
     def start(self, running: bool = False) -> None:
         """Begin a window, or wait for one."""
         self.running = running
-        self._gyro = self._screws = self._span = self._variance = 0.0
+        self._screws = self._span = 0.0
         self._readings, self._still = 0, True
 
-    def add_gyro(self, angle: float, variance: float, dt: float) -> None:
-        """The gyro has read `angle`, rad, of `variance`, rad2, in `dt` seconds."""
-        self._gyro += angle
-        self._variance += variance
+    @property
+    def begins(self) -> bool:
+        """Whether nothing is in the window yet."""
+        return self._span == 0.0
+
+    def add_gyro(self, dt: float) -> None:
+        """The gyro has turned the filter's heading for `dt` seconds."""
         self._span += dt
 
     def add_screws(self, angle: float, still: bool) -> bool:
@@ -73,13 +92,10 @@ class TurnComparison:
         """Innovation (1,), its derivative by the state (1, n) and its covariance (1, 1)."""
         span = self._span
         if self._still:
-            H = np.zeros((1, len(state)))
-            H[0, GYRO_BIAS] = span
-            R = self._variance + (self._sigma_still * span) ** 2
-            return np.array([self._gyro - state[GYRO_BIAS] * span]), H, np.array([[R]])
-        R = self._variance + self._screw_variance * span**2 / self._readings
-        innovation = self._screws - screw_turn(state, self._gyro, span)
-        return innovation, screw_turn_jacobian(state, self._gyro, span), np.array([[R]])
+            R = (self._sigma_still * span) ** 2
+            return np.array([-turned(state)]), turned_jacobian(state), np.array([[R]])
+        R = self._screw_variance * span**2 / self._readings
+        return self._screws - screw_turn(state), screw_turn_jacobian(state), np.array([[R]])
 
     def screws_alone(
         self, state: FloatArray, rate: float, still: bool, settings: RobustEstimationSection
