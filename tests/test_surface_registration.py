@@ -48,7 +48,7 @@ def test_residual_jacobian_equals_finite_differences(pose, slope):
         q = placed(points, at)
         return q[:, 2] - q[:, :2] @ slope
 
-    numeric = np.column_stack([(residual(pose + e) - residual(pose - e)) / 2e-6 for e in 1e-6 * np.eye(4)])
+    numeric = np.stack([(residual(pose + e) - residual(pose - e)) / 2e-6 for e in 1e-6 * np.eye(4)])
     np.testing.assert_allclose(
         residual_jacobian(placed(points, pose), pose, np.tile(slope, (5, 1))), numeric, atol=1e-7
     )
@@ -62,7 +62,7 @@ def test_noise_of_the_slopes_adds_to_the_information_what_it_is_said_to_add():
     drawn = []
     for _ in range(4000):
         J = residual_jacobian(q, pose, rng.normal(size=(40, 2)) @ root.T)
-        drawn.append((J.T * weight) @ J)
+        drawn.append((J * weight) @ J.T)
     added = slope_noise_information(q, pose, noise, weight)
     np.testing.assert_allclose(np.mean(drawn, axis=0)[:3, :3], added[:3, :3], atol=0.03 * added.max())
 

@@ -18,7 +18,7 @@ from robominer_slam import geometry
 from robominer_slam.configuration.robust_slam_section import ClosureSection
 from robominer_slam.slam.correlative_search import SAME_ANGLE, SAME_DISTANCE, SearchGrid, grid_around, search
 from robominer_slam.slam.surface import Surface, SurfaceModel
-from robominer_slam.slam.surface_registration import YAW, SurfaceMatch, X, Y, Z, fit, height_left_free, placed
+from robominer_slam.slam.surface_registration import YAW, SurfaceMatch, X, Y, Z, fit_each, height_left_free, placed
 
 FloatArray = NDArray[np.float64]
 
@@ -168,7 +168,8 @@ class ClosureSearch:
         """The best of the places after refinement, and by how much the next best that is another costs more."""
         height_prior = np.zeros((4, 4))
         height_prior[Z, Z] = 1.0 / HEIGHT_SIGMA**2
-        matches = [fit(surface, points, np.append(place, 0.0), height_prior, ASSOCIATIONS) for place in places]
+        guesses = np.column_stack([places, np.zeros(len(places))])
+        matches = fit_each(surface, points, guesses, height_prior, ASSOCIATIONS)
         enough = [m for m in matches if m.overlap >= self._parameters.min_overlap] or matches
         best = min(enough, key=lambda m: m.cost)
         others = [m.cost for m in enough if not _same(m.pose, best.pose)]
