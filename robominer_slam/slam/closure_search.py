@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from robominer_slam import geometry
 from robominer_slam.configuration.robust_slam_section import ClosureSection
-from robominer_slam.slam.correlative_search import SAME_ANGLE, SAME_DISTANCE, SearchGrid, grid_around, search
+from robominer_slam.slam.correlative_search import SAME_ANGLE, SAME_DISTANCE, SearchGrid, grid_within, headings, search, turned
 from robominer_slam.slam.surface import Surface, SurfaceModel
 from robominer_slam.slam.surface_registration import YAW, SurfaceMatch, X, Y, Z, fit_each, height_left_free, placed
 
@@ -148,13 +148,17 @@ class ClosureSearch:
         if int(inside.sum()) < len(points) * parameters.min_overlap:
             return None
         target = target[inside]
-        origin, shape = grid_around(low, high, parameters.cell)
+        yaw_step = np.deg2rad(parameters.yaw_step_deg)
+        # The touches lie behind the robot: the grid need only reach where they come to.
+        xy = turned(points, headings(prediction[YAW], half[YAW], yaw_step)) + prediction[:2]
+        margin = half[:2] + 4.0 * parameters.cell
+        corners = xy.min(axis=(0, 1)) - margin, xy.max(axis=(0, 1)) + margin
         found = search(
-            SearchGrid(target, origin, shape, parameters.cell),
+            SearchGrid(target, *grid_within(low, corners, parameters.cell), parameters.cell),
             points,
             prediction,
             half,
-            np.deg2rad(parameters.yaw_step_deg),
+            yaw_step,
             parameters.min_overlap,
             (self._model.touch_sigma / HEIGHT_SIGMA) ** 2 * 10.0,
             ALTERNATIVES,
