@@ -16,7 +16,15 @@ from numpy.typing import NDArray
 
 from robominer_slam import geometry
 from robominer_slam.configuration.robust_slam_section import ClosureSection
-from robominer_slam.slam.correlative_search import SAME_ANGLE, SAME_DISTANCE, SearchGrid, grid_within, headings, search, turned
+from robominer_slam.slam.correlative_search import (
+    SAME_ANGLE,
+    SAME_DISTANCE,
+    SearchGrid,
+    grid_within,
+    headings,
+    search,
+    turned,
+)
 from robominer_slam.slam.surface import Surface, SurfaceModel
 from robominer_slam.slam.surface_registration import YAW, SurfaceMatch, X, Y, Z, fit_each, height_left_free, placed
 
@@ -132,10 +140,9 @@ class ClosureSearch:
             anchor: the target's frame: one of `targets`.
         """
         parameters = self._parameters
-        T = geometry.se2_inverse(poses[anchor])
-        target = np.concatenate(
-            [placed(patches[k].points, np.append(geometry.se2_compose(T, poses[k]), 0.0)) for k in targets]
-        )
+        places = np.zeros((len(targets), 4))
+        places[:, :3] = geometry.se2_compose(geometry.se2_inverse(poses[anchor]), np.stack([poses[k] for k in targets]))
+        target = np.concatenate([placed(patches[k].points, place) for k, place in zip(targets, places, strict=True)])
         points = _thinned(source, parameters.points)
         points = points + np.array([0.0, 0.0, dz])
         c, s = np.cos(prediction[YAW]), np.sin(prediction[YAW])

@@ -168,11 +168,11 @@ def _binned(xy: FloatArray, z: FloatArray, shape: tuple[int, int], cell: float) 
 def headings(centre: float, half_window: float, step: float) -> FloatArray:
     """Headings of a search, shape (k,), all in rad."""
     turns = int(np.ceil(half_window / step))
-    return centre + np.arange(-turns, turns + 1) * step
+    return np.asarray(centre + np.arange(-turns, turns + 1) * step, dtype=np.float64)
 
 
 def turned(points: FloatArray, yaws: FloatArray) -> FloatArray:
-    """x and y of points (m, 2 or more) turned by each of k headings, rad: shape (k, m, 2)."""
+    """Points (m, 2 or more), their x and y, turned by each of k headings, rad: shape (k, m, 2)."""
     c, s = np.cos(yaws)[:, None], np.sin(yaws)[:, None]
     xy = np.empty((len(yaws), len(points), 2))
     xy[:, :, 0] = c * points[:, 0] - s * points[:, 1]

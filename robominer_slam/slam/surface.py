@@ -115,19 +115,18 @@ class Surface:
         distance, index = self._tree.query(xy, k=NEIGHBOURS, distance_upper_bound=model.reach)
         # Neighbours along the first axis: sums over them then run along whole rows of places. Those missing are
         # infinitely far and weigh nothing.
-        squared = np.square(distance.T, order="C")
+        squared = np.ascontiguousarray(np.transpose(distance)) ** 2
         count = (squared < np.inf).sum(axis=0)
         weight = 1.0 / (model.touch_sigma**2 + np.square(model.curvature * squared))
-        offset = self._columns.take(index.T, axis=1)
+        offset = self._columns.take(np.transpose(index), axis=1)
         # Heights are taken relative to the nearest touch: the regression's numbers stay small.
         datum = offset[2, 0].copy()
         offset[:2] -= xy.T[:, None]
         offset[2] -= datum
         weighted = offset * weight
         s_x, s_y, s_z = weighted.sum(axis=1)
-        xx, xy_, xz, yy, yz, zz = (
-            np.einsum("km,km->m", weighted[a], offset[b]) for a, b in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-        )
+        xx, xy_, xz = np.einsum("km,akm->am", weighted[0], offset)
+        yy, yz = np.einsum("km,akm->am", weighted[1], offset[1:])
         # The normal equations' matrix with the prior in it, and its inverse by cofactors.
         s = weight.sum(axis=0) + 1e-6 / model.touch_sigma**2
         xx += prior

@@ -150,14 +150,13 @@ def fit_each(
         offset[:, YAW] = wrap_angle(offset[:, YAW])
         pull = offset @ prior_information
         e = r
-        for again in range(REWEIGHTINGS):
-            if again:
-                e = r + (step[:, None] @ J)[:, 0]
+        for _ in range(REWEIGHTINGS):
             weight = inverse_variance / (1.0 + e * e * by_kernel)
             JtW = J * weight[:, None]
             H = JtW @ J.transpose(0, 2, 1)
-            step = -np.linalg.solve(H + regular, (JtW @ r[:, :, None])[:, :, 0][:, :, None] + pull[:, :, None])[:, :, 0]
-        e = r + (step[:, None] @ J)[:, 0]
+            right_side = JtW @ r[:, :, None] + pull[:, :, None]
+            step = -np.linalg.solve(H + regular, right_side)[:, :, 0]
+            e = r + (step[:, None] @ J)[:, 0]
         gradient = (JtW @ e[:, :, None])[:, :, 0]
         poses = poses + step
     noise = slope_noise_information(
