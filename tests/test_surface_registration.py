@@ -63,7 +63,7 @@ def test_noise_of_the_slopes_adds_to_the_information_what_it_is_said_to_add():
     for _ in range(4000):
         J = residual_jacobian(q, pose, rng.normal(size=(40, 2)) @ root.T)
         drawn.append((J * weight) @ J.T)
-    added = slope_noise_information(q, pose, noise, weight)
+    added = slope_noise_information(q, pose, np.array([noise[:, 0, 0], noise[:, 0, 1], noise[:, 1, 1]]), weight)
     np.testing.assert_allclose(np.mean(drawn, axis=0)[:3, :3], added[:3, :3], atol=0.03 * added.max())
 
 

@@ -76,14 +76,19 @@ class SurfacePatches:
 
     @property
     def slope_noise(self) -> FloatArray:
-        """Covariance of the slope by the touches' errors, shape (m, 2, 2): what of it is no ground.
+        """Covariance of the slope by the touches' errors, its xx, xy and yy, shape (3, m): what of it is no ground.
 
         The estimate is C X'W z: errors of z with covariance W^-1 reach it as C X'WX C = C - C prior C.
         """
         xx, xy, yy = self.slope_covariance
-        squared = np.stack([xx * xx + xy * xy, xy * (xx + yy), xy * xy + yy * yy])
-        noise = (self.slope_covariance - squared * self.prior_information) * np.maximum(self.misfit, LEAST_MISFIT)
-        return noise.T[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+        noise = np.empty_like(self.slope_covariance)
+        noise[0] = xx * xx + xy * xy
+        noise[1] = xy * (xx + yy)
+        noise[2] = xy * xy + yy * yy
+        noise *= -self.prior_information
+        noise += self.slope_covariance
+        noise *= np.maximum(self.misfit, LEAST_MISFIT)
+        return noise
 
 
 class Surface:
@@ -135,7 +140,11 @@ class Surface:
         c_x = xy_ * s_y - s_x * yy
         c_y = s_x * xy_ - s_y * xx
         by_determinant = 1.0 / (s * c_0 + s_x * c_x + s_y * c_y)
-        slope_covariance = np.stack([s * yy - s_y * s_y, s_x * s_y - s * xy_, s * xx - s_x * s_x]) * by_determinant
+        slope_covariance = np.empty((3, m))
+        slope_covariance[0] = s * yy - s_y * s_y
+        slope_covariance[1] = s_x * s_y - s * xy_
+        slope_covariance[2] = s * xx - s_x * s_x
+        slope_covariance *= by_determinant
         c_0, c_x, c_y = c_0 * by_determinant, c_x * by_determinant, c_y * by_determinant
         height = c_0 * s_z + c_x * xz + c_y * yz
         slope = np.empty((m, 2))

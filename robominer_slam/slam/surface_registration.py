@@ -136,32 +136,35 @@ def fit_each(
     """
     poses = guesses.copy()
     regular = prior_information + np.eye(4) * 1e-9
-    for _ in range(associations):
-        q = np.stack([placed(points, pose) for pose in poses])
+    pull = np.zeros((len(poses), 4, 1))
+    for again in range(associations):
+        q = np.empty((len(poses), *points.shape))
+        for k, pose in enumerate(poses):
+            q[k] = placed(points, pose)
         patches = surface.at(q.reshape(-1, 3)[:, :2])
         known = patches.known.reshape(len(poses), -1)
-        if int(known.sum(axis=1).min()) < LEAST_KNOWN:
+        if min(map(np.count_nonzero, known)) < LEAST_KNOWN:
             return _without_lost(surface, points, guesses, prior_information, associations, poses, known)
         r = np.where(known, q[:, :, 2] - patches.height.reshape(known.shape), 0.0)
         J = residual_jacobian(q, poses, patches.slope.reshape(*known.shape, 2))
         inverse_variance = known / patches.variance.reshape(known.shape)
         by_kernel = inverse_variance / KERNEL_WIDTH**2
-        offset = poses - guesses
-        offset[:, YAW] = wrap_angle(offset[:, YAW])
-        pull = offset @ prior_information
+        if again:
+            offset = poses - guesses
+            offset[:, YAW] = wrap_angle(offset[:, YAW])
+            pull = (offset @ prior_information)[:, :, None]
         e = r
         for _ in range(REWEIGHTINGS):
             weight = inverse_variance / (1.0 + e * e * by_kernel)
             JtW = J * weight[:, None]
             H = JtW @ J.transpose(0, 2, 1)
-            right_side = JtW @ r[:, :, None] + pull[:, :, None]
+            right_side = JtW @ r[:, :, None] + pull
             step = -np.linalg.solve(H + regular, right_side)[:, :, 0]
             e = r + (step[:, None] @ J)[:, 0]
         gradient = (JtW @ e[:, :, None])[:, :, 0]
         poses = poses + step
-    noise = slope_noise_information(
-        q, poses, (patches.slope_noise + turned_slope_noise(patches.slope)).reshape(*known.shape, 2, 2), weight
-    )
+    slope_noise = patches.slope_noise + turned_slope_noise(patches.slope)
+    noise = slope_noise_information(q, poses, slope_noise.reshape(3, *known.shape), weight)
     information = _less(H, noise)
     variance, height = patches.variance.reshape(known.shape), patches.height.reshape(known.shape)
     return [
@@ -196,12 +199,18 @@ def height_left_free(H: FloatArray) -> FloatArray:
 
 
 def turned_slope_noise(slope: FloatArray) -> FloatArray:
-    """Covariance (m, 2, 2) of slopes (m, 2) by headings that were a little off when the surface was touched.
+    """Covariance of slopes (m, 2) by headings that were a little off when the surface was touched.
 
     A ridge that was mapped slightly turned has a slope along itself, and would tell a place along it.
+
+    Returns:
+        Its xx, xy and yy, shape (3, m).
     """
-    across = slope[:, ::-1] * (-TURN_SIGMA, TURN_SIGMA)
-    noise: FloatArray = across[:, :, None] * across[:, None, :]
+    off = slope.T * TURN_SIGMA
+    noise = np.empty((3, len(slope)))
+    np.multiply(off[1], off[1], out=noise[0])
+    np.multiply(off[0], -off[1], out=noise[1])
+    np.multiply(off[0], off[0], out=noise[2])
     return noise
 
 
@@ -211,19 +220,21 @@ def slope_noise_information(q: FloatArray, pose: FloatArray, slope_noise: FloatA
     Args:
         q: touches on the surface, shape (..., m, 3), m.
         pose: of their frame, shape (..., 4).
-        slope_noise: covariance of the slopes there, shape (..., m, 2, 2).
+        slope_noise: covariance of the slopes there, its xx, xy and yy, shape (3, ..., m).
         weight: of the touches, shape (..., m).
     """
     # J' = M' slope, with M' the rows (-1, 0), (0, -1), (a, b): the sum of w M' C M, entry by entry.
     a, b = q[..., 1] - pose[..., Y, None], pose[..., X, None] - q[..., 0]
-    xx, xy, yy = (weight * slope_noise[..., i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+    xx, xy, yy = slope_noise
+    entries = np.empty((*weight.shape[:-1], 6, weight.shape[-1]))
+    entries[..., 0, :], entries[..., 1, :], entries[..., 2, :] = xx, xy, yy
     on_a, on_b = xx * a + xy * b, xy * a + yy * b
+    np.negative(on_a, out=entries[..., 3, :])
+    np.negative(on_b, out=entries[..., 4, :])
+    entries[..., 5, :] = a * on_a + b * on_b
+    sums = (entries @ weight[..., None])[..., 0]
     added = np.zeros((*pose.shape, 4))
-    added[..., X, X], added[..., Y, Y] = xx.sum(axis=-1), yy.sum(axis=-1)
-    added[..., X, Y] = added[..., Y, X] = xy.sum(axis=-1)
-    added[..., X, YAW] = added[..., YAW, X] = -on_a.sum(axis=-1)
-    added[..., Y, YAW] = added[..., YAW, Y] = -on_b.sum(axis=-1)
-    added[..., YAW, YAW] = (a * on_a + b * on_b).sum(axis=-1)
+    added[..., :3, :3] = sums[..., [[0, 1, 3], [1, 2, 4], [3, 4, 5]]]
     return added
 
 
@@ -231,7 +242,7 @@ def _less(H: FloatArray, noise: FloatArray) -> FloatArray:
     """H (k, 4, 4) without what noise adds, and somewhat more, as that is a mean; kept positive semidefinite."""
     values, vectors = np.linalg.eigh(H)
     kept = (vectors * (noise @ vectors)).sum(axis=-2)
-    share = np.clip(1.0 - NOISE_MARGIN * kept / np.maximum(values, 1e-12), 0.0, 1.0)
+    share = np.minimum(np.maximum(1.0 - NOISE_MARGIN * kept / np.maximum(values, 1e-12), 0.0), 1.0)
     return np.asarray((vectors * (values * share)[:, None]) @ vectors.transpose(0, 2, 1))
 
 
