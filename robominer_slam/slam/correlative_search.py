@@ -35,7 +35,7 @@ FILL_CELLS = 1.0
 SAME_DISTANCE = 0.06
 SAME_ANGLE = 0.10
 #: Cells of all headings that are transformed at once: enough to be few calls, few enough to stay in a cache.
-CELLS_AT_ONCE = 30_000
+CELLS_AT_ONCE = 50_000
 
 
 @dataclass(frozen=True, slots=True)

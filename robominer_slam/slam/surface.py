@@ -121,19 +121,23 @@ class Surface:
         # Neighbours along the first axis: sums over them then run along whole rows of places. Those missing are
         # infinitely far and weigh nothing.
         squared = np.ascontiguousarray(np.transpose(distance)) ** 2
-        count = (squared < np.inf).sum(axis=0)
+        count = (squared < np.inf).sum(axis=0, dtype=np.int8)
         weight = 1.0 / (model.touch_sigma**2 + np.square(model.curvature * squared))
         offset = self._columns.take(np.transpose(index), axis=1)
         # Heights are taken relative to the nearest touch: the regression's numbers stay small.
         datum = offset[2, 0].copy()
         offset[:2] -= xy.T[:, None]
         offset[2] -= datum
-        weighted = offset * weight
-        s_x, s_y, s_z = weighted.sum(axis=1)
+        weighted = offset[:2] * weight
+        s_x, s_y = weighted.sum(axis=1)
         xx, xy_, xz = np.einsum("km,akm->am", weighted[0], offset)
         yy, yz = np.einsum("km,akm->am", weighted[1], offset[1:])
+        weighted_z = weight * offset[2]
+        s_z = weighted_z.sum(axis=0)
+        zz = np.einsum("km,km->m", weighted_z, offset[2])
         # The normal equations' matrix with the prior in it, and its inverse by cofactors.
-        s = weight.sum(axis=0) + 1e-6 / model.touch_sigma**2
+        height_prior = 1e-6 / model.touch_sigma**2
+        s = weight.sum(axis=0) + height_prior
         xx += prior
         yy += prior
         c_0 = xx * yy - xy_ * xy_
@@ -150,8 +154,10 @@ class Surface:
         slope = np.empty((m, 2))
         slope[:, 0] = c_x * s_z + slope_covariance[0] * xz + slope_covariance[1] * yz
         slope[:, 1] = c_y * s_z + slope_covariance[1] * xz + slope_covariance[2] * yz
-        residual = offset[2] - height - offset[0] * slope[:, 0] - offset[1] * slope[:, 1]
-        chi2 = np.einsum("km,km,km->m", weight, residual, residual)
+        # What the plane f leaves of the weighted squares: z'Wz - f'X'Wz, without what the prior pulls f by.
+        chi2 = zz - height * (s_z + height_prior * height)
+        chi2 -= slope[:, 0] * (xz + prior * slope[:, 0]) + slope[:, 1] * (yz + prior * slope[:, 1])
+        np.maximum(chi2, 0.0, out=chi2)
         known = count >= LEAST_NEIGHBOURS
         # A step must show here, four touches that are off their plane by chance must not: the mean over the touches.
         steps = np.maximum(chi2 / np.maximum(count - 1, 1), 1.0)
