@@ -36,6 +36,8 @@ HEIGHT_SIGMA = 0.01
 ASSOCIATIONS = 3
 #: Places of a search that are refined and compared.
 ALTERNATIVES = 3
+#: A refined place may lie so far outside of the search's window, m and rad.
+BEYOND = np.array([0.05, 0.05, 0.1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,19 +151,19 @@ class ClosureSearch:
         R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         prior = R @ covariance @ R.T
         half = self._window(prior)
-        reach = np.hypot(points[:, 0], points[:, 1]).max() + half[:2] + 3.0 * parameters.cell
+        rim = float(np.hypot(points[:, 0], points[:, 1]).max())
+        reach = rim + half[:2] + 3.0 * parameters.cell
         low, high = prediction[:2] - reach, prediction[:2] + reach
-        inside = ((target[:, :2] >= low) & (target[:, :2] <= high)).all(axis=1)
-        if int(inside.sum()) < len(points) * parameters.min_overlap:
+        target = target[_within(target, low, high)]
+        if len(target) < len(points) * parameters.min_overlap:
             return None
-        target = target[inside]
         yaw_step = np.deg2rad(parameters.yaw_step_deg)
-        # The touches lie behind the robot: the grid need only reach where they come to.
+        # The touches lie behind the robot: grid and surface need only reach where they come to.
         xy = turned(points, headings(prediction[YAW], half[YAW], yaw_step)) + prediction[:2]
-        margin = half[:2] + 4.0 * parameters.cell
-        corners = xy.min(axis=(0, 1)) - margin, xy.max(axis=(0, 1)) + margin
+        first, last = xy.min(axis=(0, 1)) - half[:2], xy.max(axis=(0, 1)) + half[:2]
+        margin = 4.0 * parameters.cell
         found = search(
-            SearchGrid(target, *grid_within(low, corners, parameters.cell), parameters.cell),
+            SearchGrid(target, *grid_within(low, (first - margin, last + margin), parameters.cell), parameters.cell),
             points,
             prediction,
             half,
@@ -172,7 +174,9 @@ class ClosureSearch:
         )
         if not len(found.poses):
             return None
-        match, unique = self._refined(Surface(target, self._model), points, found.poses)
+        margin = BEYOND[X] + BEYOND[YAW] * rim + self._model.reach
+        ground = target[_within(target, first - margin, last + margin)]
+        match, unique = self._refined(Surface(ground, self._model), points, found.poses)
         return self._judged(match, unique, prediction, prior, R @ patch_covariance @ R.T, half, new, anchor, dz)
 
     def _refined(self, surface: Surface, points: FloatArray, places: FloatArray) -> tuple[SurfaceMatch, float]:
@@ -224,7 +228,7 @@ class ClosureSearch:
             and least > 0.0
             and float(np.linalg.eigvalsh(covariance[:2, :2])[-1]) <= p.max_sigma**2
             and covariance[YAW, YAW] <= np.deg2rad(p.max_sigma_yaw_deg) ** 2
-            and bool((np.abs(off) <= half + np.array([0.05, 0.05, 0.1])).all())
+            and bool((np.abs(off) <= half + BEYOND).all())
         )
         c, s = np.cos(match.pose[YAW]), np.sin(match.pose[YAW])
         R = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -239,6 +243,12 @@ class ClosureSearch:
             moved,
             good,
         )
+
+
+def _within(points: FloatArray, low: FloatArray, high: FloatArray) -> NDArray[np.bool_]:
+    """Which points (n, 2 or more) lie in a box, shape (n,)."""
+    x, y = points[:, 0], points[:, 1]
+    return np.asarray((x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1]))
 
 
 def _same(a: FloatArray, b: FloatArray) -> bool:

@@ -161,12 +161,12 @@ def linearised(
     g_x, H_xb = right[:, 0], right[:, 1:]
     rows = columns.reshape(m * 3, 1 + nb)
     by_bias = rows[:, 1:].T @ (weighted @ columns).reshape(m * 3, 1 + nb)
-    H_bb = by_bias[:, 1:] + problem.prior_information
-    g_b = by_bias[:, 0] + problem.prior_information @ (bias - problem.prior)
+    H_bb: FloatArray = by_bias[:, 1:] + problem.prior_information
+    g_b: FloatArray = by_bias[:, 0] + problem.prior_information @ (bias - problem.prior)
     solved = np.asarray(factors.solve(right))
     y_g, y_b = solved[:, 0], solved[:, 1:]
     S = H_bb - H_xb.T @ y_b
-    step_b = -np.linalg.solve(S, g_b - H_xb.T @ y_g)
+    step_b: FloatArray = -np.linalg.solve(S, g_b - H_xb.T @ y_g)
     step_x = -y_g - y_b @ step_b
     promised = -float(g_x @ step_x + g_b @ step_b)
     return factors, step_x.reshape(-1, 3), step_b, promised, y_b, S
