@@ -166,7 +166,7 @@ def linearised(
     solved = np.asarray(factors.solve(right))
     y_g, y_b = solved[:, 0], solved[:, 1:]
     S = H_bb - H_xb.T @ y_b
-    step_b: FloatArray = -np.linalg.solve(S, g_b - H_xb.T @ y_g)
+    step_b = np.asarray(-np.linalg.solve(S, g_b - H_xb.T @ y_g), dtype=np.float64)
     step_x = -y_g - y_b @ step_b
     promised = -float(g_x @ step_x + g_b @ step_b)
     return factors, step_x.reshape(-1, 3), step_b, promised, y_b, S

@@ -104,7 +104,8 @@ class Surface:
         self._model = model
         self._tree = cKDTree(points[:, :2], balanced_tree=False, compact_nodes=False) if len(points) else None
         # By coordinates, and one more: where the search finds too few touches, it tells an index past the end.
-        self._columns = np.concatenate([points, np.zeros((1, 3))]).T.copy()
+        self._columns = np.zeros((3, len(points) + 1))
+        self._columns[:, :-1] = points.T
 
     def __len__(self) -> int:
         return len(self.points)
