@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.fft import irfft2
 
-from robominer_slam.slam.correlative_search import SearchGrid, grid_around, search
+from robominer_slam.slam import correlative_search
+from robominer_slam.slam.correlative_search import SearchGrid, grid_around, grid_within, headings, search, turned
 from tests.touched_ground import flat, rough, touches
 
 CELL = 0.02
@@ -100,3 +101,20 @@ def test_alternatives_are_other_places():
         for other in found.poses[:k]:
             assert np.hypot(*(pose - other)[:2]) > 0.06 or abs(pose - other)[2] > 0.1
     assert np.all(np.diff(found.cost) >= 0.0)
+
+
+def test_headings_one_by_one_on_a_part_of_the_grid_give_the_same_places(monkeypatch):
+    rng = np.random.default_rng(4)
+    target, points = touches(rough(4), rng, 3000, (0.5, 0.5)), touches(rough(4), rng, 200, (0.1, 0.1), (0.1, 0.1, 0.0))
+    centre, half = np.array([0.05, 0.1, 0.02]), np.array([0.1, 0.1, 0.2])
+    whole = searched(target, points, centre, half)[1]
+    xy = turned(points, headings(centre[2], half[2], YAW_STEP)) + centre[:2]
+    margin = half[:2] + 4.0 * CELL
+    reach = np.hypot(points[:, 0], points[:, 1]).max() + half[:2] + 3 * CELL
+    corners = xy.min(axis=(0, 1)) - margin, xy.max(axis=(0, 1)) + margin
+    grid = SearchGrid(target, *grid_within(centre[:2] - reach, corners, CELL), CELL)
+    monkeypatch.setattr(correlative_search, "CELLS_AT_ONCE", 1)
+    part = search(grid, points, centre, half, YAW_STEP, 0.4, 1e-6)
+    np.testing.assert_allclose(part.poses, whole.poses, atol=1e-12)
+    np.testing.assert_allclose(part.cost, whole.cost, rtol=1e-9)
+    np.testing.assert_array_equal(part.overlap, whole.overlap)

@@ -12,6 +12,7 @@ from robominer_slam.configuration.robust_slam_section import ClosureSection
 from robominer_slam.slam.surface import Surface
 from robominer_slam.slam.surface_registration import (
     fit,
+    fit_each,
     height_left_free,
     placed,
     residual_jacobian,
@@ -48,7 +49,7 @@ def test_residual_jacobian_equals_finite_differences(pose, slope):
         q = placed(points, at)
         return q[:, 2] - q[:, :2] @ slope
 
-    numeric = np.column_stack([(residual(pose + e) - residual(pose - e)) / 2e-6 for e in 1e-6 * np.eye(4)])
+    numeric = np.stack([(residual(pose + e) - residual(pose - e)) / 2e-6 for e in 1e-6 * np.eye(4)])
     np.testing.assert_allclose(
         residual_jacobian(placed(points, pose), pose, np.tile(slope, (5, 1))), numeric, atol=1e-7
     )
@@ -62,8 +63,8 @@ def test_noise_of_the_slopes_adds_to_the_information_what_it_is_said_to_add():
     drawn = []
     for _ in range(4000):
         J = residual_jacobian(q, pose, rng.normal(size=(40, 2)) @ root.T)
-        drawn.append((J.T * weight) @ J)
-    added = slope_noise_information(q, pose, noise, weight)
+        drawn.append((J * weight) @ J.T)
+    added = slope_noise_information(q, pose, np.array([noise[:, 0, 0], noise[:, 0, 1], noise[:, 1, 1]]), weight)
     np.testing.assert_allclose(np.mean(drawn, axis=0)[:3, :3], added[:3, :3], atol=0.03 * added.max())
 
 
@@ -141,3 +142,17 @@ def test_a_fit_at_a_turned_place_says_the_same_as_at_home():
     here = fit(Surface(about, MODEL), points, np.zeros(4), NO_PRIOR, 4).pose
     there = fit(turned, points, np.array([0.0, 0.0, turn, 0.0]), NO_PRIOR, 4).pose
     np.testing.assert_allclose(there[:3], geometry.se2_compose(np.array([0.0, 0.0, turn]), here[:3]), atol=1e-9)
+
+
+def test_several_guesses_at_once_end_where_each_would_alone():
+    points = touches(rough(3), np.random.default_rng(7), 300, HALF, noise=4e-4)
+    surface = ground(rough(3), 3, noise=4e-4)
+    guesses = np.array([[0.01, 0.0, 0.02, 0.0], [9.0, 9.0, 0.0, 0.0], [-0.02, 0.02, -0.03, 0.002]])
+    together = fit_each(surface, points, guesses, NO_PRIOR, 3)
+    for found, guess in zip(together, guesses, strict=True):
+        alone = fit(surface, points, guess, NO_PRIOR, 3)
+        np.testing.assert_allclose(found.pose, alone.pose, atol=1e-12)
+        np.testing.assert_allclose(found.information, alone.information, rtol=1e-9, atol=1e-6)
+        assert (found.overlap, found.inliers, found.cost) == pytest.approx((alone.overlap, alone.inliers, alone.cost))
+    assert together[1].overlap == 0.0, "one is lost, and takes no other with it"
+    assert np.isinf(together[1].cost)

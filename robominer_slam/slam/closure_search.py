@@ -16,9 +16,17 @@ from numpy.typing import NDArray
 
 from robominer_slam import geometry
 from robominer_slam.configuration.robust_slam_section import ClosureSection
-from robominer_slam.slam.correlative_search import SAME_ANGLE, SAME_DISTANCE, SearchGrid, grid_around, search
+from robominer_slam.slam.correlative_search import (
+    SAME_ANGLE,
+    SAME_DISTANCE,
+    SearchGrid,
+    grid_within,
+    headings,
+    search,
+    turned,
+)
 from robominer_slam.slam.surface import Surface, SurfaceModel
-from robominer_slam.slam.surface_registration import YAW, SurfaceMatch, X, Y, Z, fit, height_left_free, placed
+from robominer_slam.slam.surface_registration import YAW, SurfaceMatch, X, Y, Z, fit_each, height_left_free, placed
 
 FloatArray = NDArray[np.float64]
 
@@ -28,6 +36,8 @@ HEIGHT_SIGMA = 0.01
 ASSOCIATIONS = 3
 #: Places of a search that are refined and compared.
 ALTERNATIVES = 3
+#: A refined place may lie so far outside of the search's window, m and rad.
+BEYOND = np.array([0.05, 0.05, 0.1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,43 +142,49 @@ class ClosureSearch:
             anchor: the target's frame: one of `targets`.
         """
         parameters = self._parameters
-        T = geometry.se2_inverse(poses[anchor])
-        target = np.concatenate(
-            [placed(patches[k].points, np.append(geometry.se2_compose(T, poses[k]), 0.0)) for k in targets]
-        )
+        places = np.zeros((len(targets), 4))
+        places[:, :3] = geometry.se2_compose(geometry.se2_inverse(poses[anchor]), np.stack([poses[k] for k in targets]))
+        target = np.concatenate([placed(patches[k].points, place) for k, place in zip(targets, places, strict=True)])
         points = _thinned(source, parameters.points)
         points = points + np.array([0.0, 0.0, dz])
         c, s = np.cos(prediction[YAW]), np.sin(prediction[YAW])
         R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         prior = R @ covariance @ R.T
         half = self._window(prior)
-        reach = np.hypot(points[:, 0], points[:, 1]).max() + half[:2] + 3.0 * parameters.cell
+        rim = float(np.hypot(points[:, 0], points[:, 1]).max())
+        reach = rim + half[:2] + 3.0 * parameters.cell
         low, high = prediction[:2] - reach, prediction[:2] + reach
-        inside = ((target[:, :2] >= low) & (target[:, :2] <= high)).all(axis=1)
-        if int(inside.sum()) < len(points) * parameters.min_overlap:
+        target = target[_within(target, low, high)]
+        if len(target) < len(points) * parameters.min_overlap:
             return None
-        target = target[inside]
-        origin, shape = grid_around(low, high, parameters.cell)
+        yaw_step = np.deg2rad(parameters.yaw_step_deg)
+        # The touches lie behind the robot: grid and surface need only reach where they come to.
+        xy = turned(points, headings(prediction[YAW], half[YAW], yaw_step)) + prediction[:2]
+        first, last = xy.min(axis=(0, 1)) - half[:2], xy.max(axis=(0, 1)) + half[:2]
+        margin = 4.0 * parameters.cell
         found = search(
-            SearchGrid(target, origin, shape, parameters.cell),
+            SearchGrid(target, *grid_within(low, (first - margin, last + margin), parameters.cell), parameters.cell),
             points,
             prediction,
             half,
-            np.deg2rad(parameters.yaw_step_deg),
+            yaw_step,
             parameters.min_overlap,
             (self._model.touch_sigma / HEIGHT_SIGMA) ** 2 * 10.0,
             ALTERNATIVES,
         )
         if not len(found.poses):
             return None
-        match, unique = self._refined(Surface(target, self._model), points, found.poses)
+        margin = BEYOND[X] + BEYOND[YAW] * rim + self._model.reach
+        ground = target[_within(target, first - margin, last + margin)]
+        match, unique = self._refined(Surface(ground, self._model), points, found.poses)
         return self._judged(match, unique, prediction, prior, R @ patch_covariance @ R.T, half, new, anchor, dz)
 
     def _refined(self, surface: Surface, points: FloatArray, places: FloatArray) -> tuple[SurfaceMatch, float]:
         """The best of the places after refinement, and by how much the next best that is another costs more."""
         height_prior = np.zeros((4, 4))
         height_prior[Z, Z] = 1.0 / HEIGHT_SIGMA**2
-        matches = [fit(surface, points, np.append(place, 0.0), height_prior, ASSOCIATIONS) for place in places]
+        guesses = np.column_stack([places, np.zeros(len(places))])
+        matches = fit_each(surface, points, guesses, height_prior, ASSOCIATIONS)
         enough = [m for m in matches if m.overlap >= self._parameters.min_overlap] or matches
         best = min(enough, key=lambda m: m.cost)
         others = [m.cost for m in enough if not _same(m.pose, best.pose)]
@@ -212,7 +228,7 @@ class ClosureSearch:
             and least > 0.0
             and float(np.linalg.eigvalsh(covariance[:2, :2])[-1]) <= p.max_sigma**2
             and covariance[YAW, YAW] <= np.deg2rad(p.max_sigma_yaw_deg) ** 2
-            and bool((np.abs(off) <= half + np.array([0.05, 0.05, 0.1])).all())
+            and bool((np.abs(off) <= half + BEYOND).all())
         )
         c, s = np.cos(match.pose[YAW]), np.sin(match.pose[YAW])
         R = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -227,6 +243,12 @@ class ClosureSearch:
             moved,
             good,
         )
+
+
+def _within(points: FloatArray, low: FloatArray, high: FloatArray) -> NDArray[np.bool_]:
+    """Which points (n, 2 or more) lie in a box, shape (n,)."""
+    x, y = points[:, 0], points[:, 1]
+    return np.asarray((x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1]))
 
 
 def _same(a: FloatArray, b: FloatArray) -> bool:

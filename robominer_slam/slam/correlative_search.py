@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import irfft2, next_fast_len, rfft2
+from scipy.fft import ifft, irfft, next_fast_len, rfft2
 from scipy.ndimage import gaussian_filter
 
 from robominer_slam.slam.surface_registration import YAW, X, Y
@@ -34,6 +34,8 @@ FILL_CELLS = 1.0
 #: Alternatives nearer than this belong to the same minimum, m and rad.
 SAME_DISTANCE = 0.06
 SAME_ANGLE = 0.10
+#: Cells of all headings that are transformed at once: enough to be few calls, few enough to stay in a cache.
+CELLS_AT_ONCE = 50_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,17 +66,15 @@ class SearchGrid:
     def __init__(self, points: FloatArray, origin: FloatArray, shape: tuple[int, int], cell: float) -> None:
         self.origin, self.shape, self.cell = origin, shape, cell
         total, count = _binned(points[:, :2] - origin, points[:, 2], shape, cell)
-        total = gaussian_filter(total, FILL_CELLS, mode="constant", truncate=2.0)
-        count = gaussian_filter(count, FILL_CELLS, mode="constant", truncate=2.0)
+        filled = (0.0, FILL_CELLS, FILL_CELLS)
+        total, count = gaussian_filter(np.stack([total, count]), filled, mode="constant", truncate=2.0)
         known = count > KNOWN_WEIGHT * gaussian_peak()
         height = np.where(known, total / np.where(known, count, 1.0), 0.0)
         # About the mean height: squares of small numbers lose no digits.
         self.datum = float(height[known].mean()) if known.any() else 0.0
         height = np.where(known, height - self.datum, 0.0)
         self.known = known
-        self.fft_known = rfft2(known.astype(np.float64))
-        self.fft_height = rfft2(height)
-        self.fft_square = rfft2(height**2)
+        self.fft_known, self.fft_height, self.fft_square = rfft2(np.stack([known, height, height**2]))
 
 
 def gaussian_peak() -> float:
@@ -104,26 +104,27 @@ def search(
         height_prior: sigma^2 / sigma_z^2, noise of a touch against that of the common height; 0 frees the height.
         count: places wanted.
     """
-    turns = int(np.ceil(half_window[YAW] / yaw_step))
-    yaws = centre[YAW] + np.arange(-turns, turns + 1) * yaw_step
+    yaws = headings(centre[YAW], half_window[YAW], yaw_step)
     reach = np.ceil(half_window[:2] / grid.cell).astype(int)
     costs = np.full((len(yaws), 2 * reach[0] + 1, 2 * reach[1] + 1), np.inf)
     overlaps = np.zeros_like(costs)
-    z = points[:, 2] - grid.datum
-    for k, yaw in enumerate(yaws):
-        c, s = np.cos(yaw), np.sin(yaw)
-        xy = np.column_stack([c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1]])
-        at = xy + centre[:2] - grid.origin
-        n, nz, nzz = _transformed(at, z, grid.shape, grid.cell)
-        N = _window(irfft2(n * grid.fft_known, s=grid.shape), reach)
-        E = _window(
-            irfft2(nzz * grid.fft_known - 2.0 * nz * grid.fft_height + n * grid.fft_square, s=grid.shape), reach
-        )
-        S = _window(irfft2(nz * grid.fft_known - n * grid.fft_height, s=grid.shape), reach)
+    weights = np.stack([np.ones(len(points)), points[:, 2] - grid.datum, (points[:, 2] - grid.datum) ** 2])
+    together = max(1, CELLS_AT_ONCE // (grid.shape[0] * grid.shape[1]))
+    for first in range(0, len(yaws), together):
+        some = slice(first, first + together)
+        at = turned(points, yaws[some]) + (centre[:2] - grid.origin)
+        n, nz, nzz = _transformed(at, weights, grid.shape, grid.cell)
+        products = np.empty((3, *n.shape), dtype=np.complex128)
+        np.multiply(n, grid.fft_known, out=products[0])
+        products[1] = nzz * grid.fft_known - 2.0 * nz * grid.fft_height + n * grid.fft_square
+        products[2] = nz * grid.fft_known - n * grid.fft_height
+        N, E, S = _shifted(products, grid.shape, reach)
+        # A whole number of touches: rounding must not decide whether they are enough.
+        N = np.rint(N)
         enough = least_overlap * len(points) <= N
         safe = np.where(enough, N, 1.0)
-        costs[k] = np.where(enough, np.maximum(E - S * S / (safe + height_prior), 0.0) / safe, np.inf)
-        overlaps[k] = N / len(points)
+        costs[some] = np.where(enough, np.maximum(E - S * S / (safe + height_prior), 0.0) / safe, np.inf)
+        overlaps[some] = N / len(points)
     return _minima(costs, overlaps, yaws, centre, reach, grid.cell, count)
 
 
@@ -164,22 +165,46 @@ def _binned(xy: FloatArray, z: FloatArray, shape: tuple[int, int], cell: float) 
     return total.reshape(shape), count.reshape(shape)
 
 
-def _transformed(xy: FloatArray, z: FloatArray, shape: tuple[int, int], cell: float) -> tuple[FloatArray, ...]:
-    """Conjugate transforms of count, sum of z and sum of z^2 per cell: multiplied with another's, a correlation."""
-    ij = np.floor(xy / cell).astype(np.int64) % np.array(shape)  # a shift wraps round as the transform does
-    place = ij[:, 0] * shape[1] + ij[:, 1]
-    size = shape[0] * shape[1]
-    return tuple(
-        np.conj(rfft2(np.bincount(place, weights=w, minlength=size).reshape(shape).astype(np.float64)))
-        for w in (np.ones_like(z), z, z * z)
-    )
+def headings(centre: float, half_window: float, step: float) -> FloatArray:
+    """Headings of a search, shape (k,), all in rad."""
+    turns = int(np.ceil(half_window / step))
+    return np.asarray(centre + np.arange(-turns, turns + 1) * step, dtype=np.float64)
 
 
-def _window(correlation: FloatArray, reach: NDArray[np.int_]) -> FloatArray:
-    """Shifts from -reach to reach along both axes, from the wrapped order of a transform."""
+def turned(points: FloatArray, yaws: FloatArray) -> FloatArray:
+    """Points (m, 2 or more), their x and y, turned by each of k headings, rad: shape (k, m, 2)."""
+    c, s = np.cos(yaws)[:, None], np.sin(yaws)[:, None]
+    xy = np.empty((len(yaws), len(points), 2))
+    xy[:, :, 0] = c * points[:, 0] - s * points[:, 1]
+    xy[:, :, 1] = s * points[:, 0] + c * points[:, 1]
+    return xy
+
+
+def _transformed(at: FloatArray, weights: FloatArray, shape: tuple[int, int], cell: float) -> NDArray[np.complex128]:
+    """Conjugate transforms of weights summed per cell: multiplied with another's, a correlation.
+
+    Args:
+        at: x and y of m touches at each of k headings, from the grid's corner, shape (k, m, 2), m.
+        weights: of the touches, w sets, shape (w, m).
+        shape, cell: of the grid.
+
+    Returns:
+        Shape (w, k, *that of a transform).
+    """
+    ij = np.floor(at / cell).astype(np.int64) % np.array(shape)  # a shift wraps round as the transform does
+    k, size = len(at), shape[0] * shape[1]
+    place = (ij[:, :, 0] * shape[1] + ij[:, :, 1] + np.arange(k)[:, None] * size).reshape(-1)
+    sums = np.stack([np.bincount(place, weights=np.tile(w, k), minlength=k * size) for w in weights])
+    transforms = rfft2(sums.reshape(len(weights), k, *shape))
+    return np.conjugate(transforms, out=transforms)
+
+
+def _shifted(products: NDArray[np.complex128], shape: tuple[int, int], reach: NDArray[np.int_]) -> FloatArray:
+    """Transforms back, shifts from -reach to reach along the last two axes alone: of other rows one half is spared."""
     rows = np.arange(-reach[0], reach[0] + 1)
     columns = np.arange(-reach[1], reach[1] + 1)
-    cut: FloatArray = correlation[np.ix_(rows, columns)]
+    along_x = ifft(products, axis=-2, overwrite_x=True).take(rows, axis=-2, mode="wrap")
+    cut: FloatArray = irfft(along_x, n=shape[1], axis=-1).take(columns, axis=-1, mode="wrap")
     return cut
 
 
@@ -187,3 +212,11 @@ def grid_around(low: FloatArray, high: FloatArray, cell: float) -> tuple[FloatAr
     """Corner and shape of a grid over a box; shapes that transform fast."""
     cells = np.ceil((high - low) / cell).astype(int) + 1
     return low, (next_fast_len(int(cells[0]), real=True), next_fast_len(int(cells[1]), real=True))
+
+
+def grid_within(
+    low: FloatArray, corners: tuple[FloatArray, FloatArray], cell: float
+) -> tuple[FloatArray, tuple[int, int]]:
+    """As `grid_around`, for the part between two corners of a larger grid from `low` on: its cells are the same."""
+    first = np.floor((corners[0] - low) / cell)
+    return grid_around(low + first * cell, corners[1], cell)

@@ -10,8 +10,10 @@ alone, held by those before them at their present poses.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 
@@ -99,7 +101,15 @@ class KeyframeGraph:
 
     def relative(self, i: int, j: int) -> FloatArray:
         """Pose (x, y, heading) of keyframe j in keyframe i, shape (3,)."""
-        return geometry.se2_compose(geometry.se2_inverse(self.nodes[i]), self.nodes[j])
+        x_i, y_i, yaw_i = self.nodes[i].tolist()
+        x_j, y_j, yaw_j = self.nodes[j].tolist()
+        c, s, x, y = math.cos(yaw_i), math.sin(yaw_i), x_j - x_i, y_j - y_i
+        return np.array([c * x + s * y, c * y - s * x, math.remainder(yaw_j - yaw_i, math.tau)])
+
+    def relatives(self, i: ArrayLike, j: ArrayLike) -> FloatArray:
+        """As `relative`, of many pairs at once, shape (m, 3); one of the two may be a single keyframe."""
+        poses = self.nodes.poses
+        return geometry.se2_compose(geometry.se2_inverse(poses[self.nodes.rows(i)]), poses[self.nodes.rows(j)])
 
     def marginals(self) -> GraphMarginals:
         """Covariances at the present poses, by one factorisation."""

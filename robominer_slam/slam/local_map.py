@@ -84,9 +84,10 @@ class LocalMap:
         if not len(points):
             return np.zeros(0, dtype=np.intp)
         ij = np.floor(points[:, :2] / self._cell).astype(np.int64)
-        order = np.argsort(ij[:, 0] * KEY_STRIDE + ij[:, 1], kind="stable")
-        sorted_ij = ij[order]
-        first = np.concatenate([[True], (sorted_ij[1:] != sorted_ij[:-1]).any(axis=1)])
-        start = np.maximum.accumulate(np.where(first, np.arange(len(order)), 0))
-        rank = np.arange(len(order)) - start
-        return np.sort(order[rank < self._per_cell])
+        key = ij[:, 0] * KEY_STRIDE + ij[:, 1]
+        order = np.argsort(key, kind="stable")
+        key = key[order]
+        # One is too many where the cell is that of the touch so many places before it.
+        kept = np.ones(len(points), dtype=np.bool_)
+        kept[order[self._per_cell :][key[self._per_cell :] == key[: -self._per_cell]]] = False
+        return np.flatnonzero(kept)

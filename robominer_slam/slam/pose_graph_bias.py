@@ -23,7 +23,7 @@ from scipy.sparse.linalg import SuperLU
 
 from robominer_slam import geometry
 from robominer_slam.slam import pose_graph_residuals as residuals
-from robominer_slam.slam.pose_graph_optimizer import EdgeCosts, Kernels, edge_costs, normal_equations
+from robominer_slam.slam.pose_graph_optimizer import EdgeCosts, Kernels, edge_costs
 from robominer_slam.slam.pose_graph_residuals import EdgeArrays
 from robominer_slam.slam.pose_graph_system import SystemPattern
 
@@ -148,26 +148,25 @@ def linearised(
         Factors of H_xx, steps of poses (f, 3) and bias (nb,), promised gain, H_xx^-1 H_xb (3 f, nb), and the bias's
         information when the poses are eliminated (nb, nb).
     """
-    edges = problem.edges(bias)
-    gradient, blocks = normal_equations(edges, costs, poses, pivot, system, "gtsam")
-    factors = system.factorise(blocks)
-    J = residuals.error_slopes(2, costs.E, costs.e, "gtsam") @ residuals.world_to_node(2, poses, pivot)[edges.j]
-    J_Omega = np.swapaxes(J, -1, -2) @ (costs.weights[:, None, None] * edges.information)
-    weighted = costs.weights[:, None, None] * edges.information
-    B = -problem.jacobian
-    nb = bias.size
-    cross = J_Omega @ B
-    H_xb = np.zeros((gradient.size, nb))
-    for c in range(nb):
-        H_xb[:, c] = system.gradient(cross[:, :, c]).reshape(-1)
-    BtW = np.swapaxes(B, -1, -2) @ weighted
-    H_bb = (BtW @ B).sum(axis=0) + problem.prior_information
-    g_b = (BtW @ costs.e[:, :, None])[:, :, 0].sum(axis=0) + problem.prior_information @ (bias - problem.prior)
-    g_x = gradient.reshape(-1)
-    solved = np.asarray(factors.solve(np.column_stack([g_x, H_xb])))
+    J = residuals.error_slopes(2, costs.E, costs.e, "gtsam") @ residuals.world_to_node(2, poses, pivot)[problem.j]
+    weighted = costs.weights[:, None, None] * problem.information
+    J_Omega = J.transpose(0, 2, 1) @ weighted
+    factors = system.factorise(system.hessian_blocks(J_Omega @ J))
+    # The errors and the bias's columns together: what the edges have of H_xb and of the gradient sums up likewise.
+    nb, m = bias.size, len(problem.i)
+    columns = np.empty((m, 3, 1 + nb))
+    columns[:, :, 0] = costs.e
+    np.negative(problem.jacobian, out=columns[:, :, 1:])
+    right = system.gradient((J_Omega @ columns).reshape(m, 3 * (1 + nb))).reshape(-1, 1 + nb)
+    g_x, H_xb = right[:, 0], right[:, 1:]
+    rows = columns.reshape(m * 3, 1 + nb)
+    by_bias = rows[:, 1:].T @ (weighted @ columns).reshape(m * 3, 1 + nb)
+    H_bb: FloatArray = by_bias[:, 1:] + problem.prior_information
+    g_b: FloatArray = by_bias[:, 0] + problem.prior_information @ (bias - problem.prior)
+    solved = np.asarray(factors.solve(right))
     y_g, y_b = solved[:, 0], solved[:, 1:]
     S = H_bb - H_xb.T @ y_b
-    step_b = -np.linalg.solve(S, g_b - H_xb.T @ y_g)
+    step_b = np.asarray(-np.linalg.solve(S, g_b - H_xb.T @ y_g), dtype=np.float64)
     step_x = -y_g - y_b @ step_b
     promised = -float(g_x @ step_x + g_b @ step_b)
     return factors, step_x.reshape(-1, 3), step_b, promised, y_b, S

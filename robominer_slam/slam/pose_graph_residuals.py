@@ -93,9 +93,15 @@ def error_slopes(dim: int, E: FloatArray, e: FloatArray, convention: Convention)
 def world_to_node(dim: int, poses: FloatArray, pivot: FloatArray) -> FloatArray:
     """Ad(X^-1 C) per node, shape (n, d, d): from a perturbation about `pivot` to one in the node's own frame."""
     if dim == 2:
-        centred = poses.copy()
-        centred[:, :2] -= pivot
-        return geometry.se2_adjoint(geometry.se2_inverse(centred))
+        x, y = poses[:, 0] - pivot[0], poses[:, 1] - pivot[1]
+        Ad = np.zeros((len(poses), 3, 3))
+        Ad[:, 0, 0] = Ad[:, 1, 1] = c = np.cos(poses[:, 2])
+        Ad[:, 0, 1] = s = np.sin(poses[:, 2])
+        Ad[:, 1, 0] = -s
+        Ad[:, 0, 2] = s * x - c * y
+        Ad[:, 1, 2] = c * x + s * y
+        Ad[:, 2, 2] = 1.0
+        return Ad
     centred = poses.copy()
     centred[:, :3, 3] -= pivot
     return geometry.se3_adjoint(geometry.inverse(centred))

@@ -99,7 +99,7 @@ class SystemPattern:
         self._H.has_sorted_indices = True
 
     def gradient(self, edge_gradients: FloatArray) -> FloatArray:
-        """Sum of the edges' gradients J_j' Omega e, shape (m, d), over the free nodes, shape (f, d)."""
+        """Sum of the edges' gradients J_j' Omega e, shape (m, d), over the free nodes, shape (f, d); d may be any."""
         return np.asarray(self._gradient_of_edges @ edge_gradients)
 
     def hessian_blocks(self, edge_blocks: FloatArray) -> FloatArray:
@@ -135,7 +135,10 @@ def _signed_selection(shape: tuple[int, int], entries: list[tuple[IndexArray, In
     rows = np.concatenate([row for row, _, _ in entries])
     columns = np.concatenate([column for _, column, _ in entries])
     values = np.concatenate([np.full(row.size, sign) for row, _, sign in entries])
-    return csr_matrix((values, (rows, columns)), shape=shape)
+    by_row = np.argsort(rows, kind="stable")
+    start = np.zeros(shape[0] + 1, dtype=np.int32)
+    np.cumsum(np.bincount(rows, minlength=shape[0]), out=start[1:])
+    return csr_matrix((values[by_row], columns[by_row].astype(np.int32), start), shape=shape)
 
 
 def _elimination_order(a: IndexArray, b: IndexArray, f: int) -> IndexArray:

@@ -6,8 +6,7 @@ it; then both enter the graph. After optimising, closures that the graph contrad
 it no longer contradicts return. Closures that agree with the present estimate move its last keyframes only; what the
 map keeps is bounded (`bounded_map`).
 
-Sources: Mangelson et al., "Pairwise consistent measurement set maximization" (ICRA 2018) for agreement; Latif et
-al., "Robust loop closing over time" (IJRR 2013) for taking closures back.
+Source: Latif et al., "Robust loop closing over time" (IJRR 2013), for taking closures back.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from robominer_slam import geometry
 from robominer_slam.configuration.robust_slam_section import RobustSlamSection
 from robominer_slam.slam.bounded_map import BoundedMap
+from robominer_slam.slam.closure_agreement import agreeing
 from robominer_slam.slam.closure_counters import ClosureCounters
 from robominer_slam.slam.closure_search import Closure, ClosureSearch, Patch
 from robominer_slam.slam.composite_scan import voxel_filter
@@ -178,7 +178,8 @@ class RobustBackend:
         reach = self._parameters.closure.sigmas * sigma
         found = []
         for ids in self._chosen(k, self._search.passes(k, self._outlines(reach), nodes, reach)):
-            anchor = min(ids, key=lambda i: float(np.hypot(*graph.relative(i, k)[:2])))
+            off = nodes.poses[nodes.rows(ids), :2] - nodes.poses[-1, :2]
+            anchor = ids[int(np.argmin(np.hypot(off[:, 0], off[:, 1])))]
             covariance = self._tracked.relative(anchor)
             closure = self._search.find(
                 source,
@@ -229,7 +230,7 @@ class RobustBackend:
         accepted: list[Closure] = []
         for closure in found:
             others = [c for c in (*self._recent, *self._pending) if c.j != closure.j]
-            partners = [c for c in others if self._agree(c, closure)]
+            partners = agreeing(self._graph, others, closure, p.agreement)
             if len(partners) >= p.partners:
                 accepted.append(closure)
                 accepted += [c for c in partners if any(c is w for w in self._pending)]
@@ -238,18 +239,6 @@ class RobustBackend:
                 self._pending.append(closure)
         self._recent += accepted
         return accepted
-
-    def _agree(self, a: Closure, b: Closure) -> bool:
-        """Whether two closures say the same of the way between their keyframes."""
-        graph = self._graph
-        # b predicted through a: anchor of b -> anchor of a -> keyframe of a -> keyframe of b.
-        way = geometry.se2_compose(geometry.se2_compose(graph.relative(b.i, a.i), a.Z), graph.relative(a.j, b.j))
-        error = geometry.se2_log(geometry.se2_compose(geometry.se2_inverse(way), b.Z))
-        Ad = geometry.se2_adjoint(graph.relative(b.j, a.j))
-        covariance = Ad @ a.covariance @ Ad.T + b.covariance + graph.odometry_between(a.j, b.j)
-        if a.i != b.i:
-            covariance = covariance + graph.odometry_between(a.i, b.i)
-        return float(error @ np.linalg.solve(covariance, error)) <= self._parameters.closure.agreement
 
     def _add_loop(self, closure: Closure) -> None:
         nb = self._graph.bias.size

@@ -7,13 +7,13 @@ the dead reckoning rules. Contacts share the errors of their whiskers, so their 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robominer_slam.configuration.robust_slam_section import ScanMatchingSection
-from robominer_slam.geometry import wrap_angle
 from robominer_slam.slam.local_map import LocalMap
 from robominer_slam.slam.surface import SurfaceModel
 from robominer_slam.slam.surface_registration import YAW, SurfaceMatch, Z, fit, height_left_free, placed
@@ -95,7 +95,7 @@ class ScanOdometry:
             return None
         self.matches += 1
         offset = found.pose - pose
-        offset[YAW] = wrap_angle(offset[YAW])
+        offset[YAW] = math.remainder(offset[YAW], math.tau)
         # With the common height left free: what remains is about x, y and heading.
         # The touches' noise pulls at d as much as H says, whatever of H the slopes' errors have made up: with
         # H0 d = -g, the information of d is H0 H^-1 H0.
@@ -135,16 +135,18 @@ class ScanOdometry:
 
     def _travel(self, pose: FloatArray) -> None:
         if self._before is not None:
-            step = pose - self._before
-            self.travelled += float(np.hypot(step[0], step[1])) + TURN_ARM * abs(float(wrap_angle(step[YAW])))
+            self.travelled += _way(self._before, pose)
         self._before = pose.copy()
 
     def _due(self, pose: FloatArray) -> bool:
-        if self._last is None:
-            return True
-        step = pose - self._last
-        moved = float(np.hypot(step[0], step[1])) + TURN_ARM * abs(float(wrap_angle(step[YAW])))
-        return moved >= self._parameters.step
+        return self._last is None or _way(self._last, pose) >= self._parameters.step
+
+
+def _way(a: FloatArray, b: FloatArray) -> float:
+    """From one pose (x, y, yaw, ...) to the other as the whiskers go, m."""
+    x_a, y_a, yaw_a, *_ = a.tolist()
+    x_b, y_b, yaw_b, *_ = b.tolist()
+    return math.hypot(x_b - x_a, y_b - y_a) + TURN_ARM * abs(math.remainder(yaw_b - yaw_a, math.tau))
 
 
 def _least(information: FloatArray, right_side: FloatArray) -> FloatArray:

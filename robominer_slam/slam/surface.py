@@ -61,14 +61,34 @@ class SurfacePatches:
         height: shape (m,), m; 0 where it is not known.
         slope: dz/dx, dz/dy, shape (m, 2).
         variance: of a new touch's height there, shape (m,), m2.
-        slope_noise: covariance of the slope by the touches' errors, shape (m, 2, 2): what of it is no ground.
+        slope_covariance: of the slope as the regression says it, its xx, xy and yy, shape (3, m).
+        misfit: of the touches to their plane, in variances, shape (m,).
+        prior_information: of the slope's prior, 1.
     """
 
     known: NDArray[np.bool_]
     height: FloatArray
     slope: FloatArray
     variance: FloatArray
-    slope_noise: FloatArray
+    slope_covariance: FloatArray
+    misfit: FloatArray
+    prior_information: float
+
+    @property
+    def slope_noise(self) -> FloatArray:
+        """Covariance of the slope by the touches' errors, its xx, xy and yy, shape (3, m): what of it is no ground.
+
+        The estimate is C X'W z: errors of z with covariance W^-1 reach it as C X'WX C = C - C prior C.
+        """
+        xx, xy, yy = self.slope_covariance
+        noise = np.empty_like(self.slope_covariance)
+        noise[0] = xx * xx + xy * xy
+        noise[1] = xy * (xx + yy)
+        noise[2] = xy * xy + yy * yy
+        noise *= -self.prior_information
+        noise += self.slope_covariance
+        noise *= np.maximum(self.misfit, LEAST_MISFIT)
+        return noise
 
 
 class Surface:
@@ -83,6 +103,9 @@ class Surface:
         self.points = points
         self._model = model
         self._tree = cKDTree(points[:, :2], balanced_tree=False, compact_nodes=False) if len(points) else None
+        # By coordinates, and one more: where the search finds too few touches, it tells an index past the end.
+        self._columns = np.zeros((3, len(points) + 1))
+        self._columns[:, :-1] = points.T
 
     def __len__(self) -> int:
         return len(self.points)
@@ -90,38 +113,57 @@ class Surface:
     def at(self, xy: FloatArray) -> SurfacePatches:
         """The surface at places of shape (m, 2), m."""
         m = len(xy)
-        if self._tree is None or len(self.points) < LEAST_NEIGHBOURS or m == 0:
-            none = np.zeros((m, 2, 2))
-            return SurfacePatches(np.zeros(m, dtype=np.bool_), np.zeros(m), np.zeros((m, 2)), np.ones(m), none)
         model = self._model
+        prior = 1.0 / model.slope_sigma**2
+        if self._tree is None or len(self.points) < LEAST_NEIGHBOURS or m == 0:
+            nothing = np.zeros((3, m)), np.zeros(m), prior
+            return SurfacePatches(np.zeros(m, dtype=np.bool_), np.zeros(m), np.zeros((m, 2)), np.ones(m), *nothing)
         distance, index = self._tree.query(xy, k=NEIGHBOURS, distance_upper_bound=model.reach)
-        near = index < len(self.points)
-        neighbours = self.points[np.where(near, index, 0)]
-        squared = np.where(near, distance, 0.0) ** 2
-        weight = near / (model.touch_sigma**2 + (model.curvature * squared) ** 2)
+        # Neighbours along the first axis: sums over them then run along whole rows of places. Those missing are
+        # infinitely far and weigh nothing.
+        squared = np.ascontiguousarray(np.transpose(distance)) ** 2
+        count = (squared < np.inf).sum(axis=0, dtype=np.int8)
+        weight = 1.0 / (model.touch_sigma**2 + np.square(model.curvature * squared))
+        offset = self._columns.take(np.transpose(index), axis=1)
         # Heights are taken relative to the nearest touch: the regression's numbers stay small.
-        datum = neighbours[:, 0, 2]
-        z = neighbours[:, :, 2] - datum[:, None]
-        X = np.empty((m, NEIGHBOURS, 3))
-        X[:, :, 0] = 1.0
-        X[:, :, 1:] = neighbours[:, :, :2] - xy[:, None]
-        XtW = (X * weight[:, :, None]).transpose(0, 2, 1)
-        A = XtW @ X
-        A[:, 0, 0] += 1e-6 / model.touch_sigma**2
-        A[:, [1, 2], [1, 2]] += 1.0 / model.slope_sigma**2
-        covariance = np.linalg.inv(A)
-        fitted = (covariance @ (XtW @ z[:, :, None]))[:, :, 0]
-        residual = z - (X @ fitted[:, :, None])[:, :, 0]
-        count = near.sum(axis=1)
-        chi2 = (weight * residual**2).sum(axis=1)
+        datum = offset[2, 0].copy()
+        offset[:2] -= xy.T[:, None]
+        offset[2] -= datum
+        weighted = offset[:2] * weight
+        s_x, s_y = weighted.sum(axis=1)
+        xx, xy_, xz = np.einsum("km,akm->am", weighted[0], offset)
+        yy, yz = np.einsum("km,akm->am", weighted[1], offset[1:])
+        weighted_z = weight * offset[2]
+        s_z = weighted_z.sum(axis=0)
+        zz = np.einsum("km,km->m", weighted_z, offset[2])
+        # The normal equations' matrix with the prior in it, and its inverse by cofactors.
+        height_prior = 1e-6 / model.touch_sigma**2
+        s = weight.sum(axis=0) + height_prior
+        xx += prior
+        yy += prior
+        c_0 = xx * yy - xy_ * xy_
+        c_x = xy_ * s_y - s_x * yy
+        c_y = s_x * xy_ - s_y * xx
+        by_determinant = 1.0 / (s * c_0 + s_x * c_x + s_y * c_y)
+        slope_covariance = np.empty((3, m))
+        slope_covariance[0] = s * yy - s_y * s_y
+        slope_covariance[1] = s_x * s_y - s * xy_
+        slope_covariance[2] = s * xx - s_x * s_x
+        slope_covariance *= by_determinant
+        c_0, c_x, c_y = c_0 * by_determinant, c_x * by_determinant, c_y * by_determinant
+        height = c_0 * s_z + c_x * xz + c_y * yz
+        slope = np.empty((m, 2))
+        slope[:, 0] = c_x * s_z + slope_covariance[0] * xz + slope_covariance[1] * yz
+        slope[:, 1] = c_y * s_z + slope_covariance[1] * xz + slope_covariance[2] * yz
+        # What the plane f leaves of the weighted squares: z'Wz - f'X'Wz, without what the prior pulls f by.
+        chi2 = zz - height * (s_z + height_prior * height)
+        chi2 -= slope[:, 0] * (xz + prior * slope[:, 0]) + slope[:, 1] * (yz + prior * slope[:, 1])
+        np.maximum(chi2, 0.0, out=chi2)
         known = count >= LEAST_NEIGHBOURS
         # A step must show here, four touches that are off their plane by chance must not: the mean over the touches.
         steps = np.maximum(chi2 / np.maximum(count - 1, 1), 1.0)
-        variance = covariance[:, 0, 0] * steps + model.touch_sigma**2
-        # The estimate is C X'W z: errors of z with covariance W^-1 reach it as C X'WX C = C - C prior C.
-        by_slope = covariance[:, 1:, 1:]
-        slope_noise = by_slope - (by_slope @ by_slope) / model.slope_sigma**2
+        variance = c_0 * steps + model.touch_sigma**2
         misfit = chi2 / np.maximum(count - UNKNOWNS, 1)
-        slope_noise *= np.maximum(misfit, LEAST_MISFIT)[:, None, None]
-        height = np.where(known, datum + fitted[:, 0], 0.0)
-        return SurfacePatches(known, height, fitted[:, 1:], variance, slope_noise)
+        return SurfacePatches(
+            known, np.where(known, datum + height, 0.0), slope, variance, slope_covariance, misfit, prior
+        )

@@ -11,13 +11,14 @@ ICP's covariance" (ICRA 2007) for what H says and what it does not (touches shar
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robominer_slam.geometry import wrap_angle
-from robominer_slam.slam.surface import Surface, SurfacePatches
+from robominer_slam.slam.surface import Surface
 
 FloatArray = NDArray[np.float64]
 
@@ -31,6 +32,8 @@ KERNEL_WIDTH = 2.5
 NOISE_MARGIN = 1.5
 #: Deviation of headings within a surface, rad.
 TURN_SIGMA = 0.03
+#: Touches on known ground that a match takes at least: as many as it has unknowns.
+LEAST_KNOWN = 4
 #: Residuals under this many sigmas count as fitting.
 INLIER_SIGMAS = 3.0
 
@@ -74,17 +77,29 @@ class SurfaceMatch:
 
 def placed(points: FloatArray, pose: FloatArray) -> FloatArray:
     """Points (m, 3) of a frame at `pose` (x, y, yaw, z) in the other frame, m."""
-    c, s = np.cos(pose[YAW]), np.sin(pose[YAW])
+    c, s = math.cos(pose[YAW]), math.sin(pose[YAW])
     x, y = points[:, 0], points[:, 1]
-    return np.column_stack([c * x - s * y + pose[X], s * x + c * y + pose[Y], points[:, 2] + pose[Z]])
+    q = np.empty((len(points), 3))
+    q[:, 0] = c * x - s * y + pose[X]
+    q[:, 1] = s * x + c * y + pose[Y]
+    q[:, 2] = points[:, 2] + pose[Z]
+    return q
 
 
 def residual_jacobian(q: FloatArray, pose: FloatArray, slope: FloatArray) -> FloatArray:
-    """Derivative (m, 4) of z - h(x, y) by (x, y, yaw, z), for touches at q (m, 3) on a surface of `slope` (m, 2)."""
-    J = np.empty((len(q), 4))
-    J[:, :2] = -slope
-    J[:, YAW] = slope[:, 0] * (q[:, 1] - pose[Y]) - slope[:, 1] * (q[:, 0] - pose[X])
-    J[:, Z] = 1.0
+    """Derivatives of z - h(x, y) by (x, y, yaw, z), shape (..., 4, m): a row for each of the four.
+
+    Args:
+        q: touches on the surface, shape (..., m, 3), m.
+        pose: of their frame, shape (..., 4).
+        slope: of the surface there, shape (..., m, 2).
+    """
+    J = np.empty((*slope.shape[:-2], 4, slope.shape[-2]))
+    along_x, along_y = slope[..., 0], slope[..., 1]
+    np.negative(along_x, out=J[..., X, :])
+    np.negative(along_y, out=J[..., Y, :])
+    J[..., YAW, :] = along_x * (q[..., 1] - pose[..., Y, None]) - along_y * (q[..., 0] - pose[..., X, None])
+    J[..., Z, :] = 1.0
     return J
 
 
@@ -105,35 +120,76 @@ def fit(
             or the step is only as long as they say.
         associations: how often planes are looked up; once suffices where the guess is good to millimetres.
     """
-    pose = guess.copy()
-    H, gradient = np.zeros((4, 4)), np.zeros(4)
+    return fit_each(surface, points, guess[None], prior_information, associations)[0]
+
+
+def fit_each(
+    surface: Surface,
+    points: FloatArray,
+    guesses: FloatArray,
+    prior_information: FloatArray,
+    associations: int = 2,
+) -> list[SurfaceMatch]:
+    """As `fit`, from each of several guesses, shape (k, 4): together they cost less than one after the other.
+
+    Touches where the surface is not known weigh nothing.
+    """
+    poses = guesses.copy()
     regular = prior_information + np.eye(4) * 1e-9
-    for _ in range(associations):
-        q = placed(points, pose)
-        patches = surface.at(q[:, :2])
-        known = patches.known
-        if int(known.sum()) < 4:
-            nothing = np.zeros((4, 4))
-            return SurfaceMatch(
-                pose, nothing, nothing, np.zeros(4), float(known.mean()), 0.0, 0.0, np.inf, np.zeros((0, 3))
-            )
-        r = q[known, 2] - patches.height[known]
-        J = residual_jacobian(q[known], pose, patches.slope[known])
-        inverse_variance = 1.0 / patches.variance[known]
-        offset = pose - guess
-        offset[YAW] = wrap_angle(offset[YAW])
-        step = np.zeros(4)
+    pull = np.zeros((len(poses), 4, 1))
+    for again in range(associations):
+        q = np.empty((len(poses), *points.shape))
+        for k, pose in enumerate(poses):
+            q[k] = placed(points, pose)
+        patches = surface.at(q.reshape(-1, 3)[:, :2])
+        known = patches.known.reshape(len(poses), -1)
+        if min(map(np.count_nonzero, known)) < LEAST_KNOWN:
+            return _without_lost(surface, points, guesses, prior_information, associations, poses, known)
+        r = np.where(known, q[:, :, 2] - patches.height.reshape(known.shape), 0.0)
+        J = residual_jacobian(q, poses, patches.slope.reshape(*known.shape, 2))
+        inverse_variance = known / patches.variance.reshape(known.shape)
+        by_kernel = inverse_variance / KERNEL_WIDTH**2
+        if again:
+            offset = poses - guesses
+            offset[:, YAW] = wrap_angle(offset[:, YAW])
+            pull = (offset @ prior_information)[:, :, None]
+        e = r
         for _ in range(REWEIGHTINGS):
-            e = r + J @ step
-            weight = inverse_variance / (1.0 + e * e * inverse_variance / KERNEL_WIDTH**2)
-            JtW = J.T * weight
-            H = JtW @ J
-            step = np.linalg.solve(H + regular, -JtW @ r - prior_information @ offset)
-        gradient = JtW @ (r + J @ step)
-        pose = pose + step
-    slope_noise = patches.slope_noise[known] + turned_slope_noise(patches.slope[known])
-    noise = slope_noise_information(q[known], pose, slope_noise, weight)
-    return _judged(pose, (_less(H, noise), H), gradient, patches, q, r + J @ step)
+            weight = inverse_variance / (1.0 + e * e * by_kernel)
+            JtW = J * weight[:, None]
+            H = JtW @ J.transpose(0, 2, 1)
+            right_side = JtW @ r[:, :, None] + pull
+            step = -np.linalg.solve(H + regular, right_side)[:, :, 0]
+            e = r + (step[:, None] @ J)[:, 0]
+        gradient = (JtW @ e[:, :, None])[:, :, 0]
+        poses = poses + step
+    slope_noise = patches.slope_noise + turned_slope_noise(patches.slope)
+    noise = slope_noise_information(q, poses, slope_noise.reshape(3, *known.shape), weight)
+    information = _less(H, noise)
+    variance, height = patches.variance.reshape(known.shape), patches.height.reshape(known.shape)
+    return [
+        _judged(poses[k], (information[k], H[k]), gradient[k], known[k], variance[k], height[k], q[k], e[k])
+        for k in range(len(poses))
+    ]
+
+
+def _without_lost(
+    surface: Surface,
+    points: FloatArray,
+    guesses: FloatArray,
+    prior_information: FloatArray,
+    associations: int,
+    poses: FloatArray,
+    known: NDArray[np.bool_],
+) -> list[SurfaceMatch]:
+    """Matches of guesses of which some, at `poses` by now, have left the known ground: the others go on alone."""
+    lost = known.sum(axis=1) < LEAST_KNOWN
+    nothing = np.zeros((4, 4)), np.zeros((4, 4)), np.zeros(4)
+    left = iter(fit_each(surface, points, guesses[~lost], prior_information, associations) if not lost.all() else ())
+    return [
+        SurfaceMatch(pose, *nothing, float(on.mean()), 0.0, 0.0, np.inf, np.zeros((0, 3))) if gone else next(left)
+        for pose, on, gone in zip(poses, known, lost, strict=True)
+    ]
 
 
 def height_left_free(H: FloatArray) -> FloatArray:
@@ -143,51 +199,69 @@ def height_left_free(H: FloatArray) -> FloatArray:
 
 
 def turned_slope_noise(slope: FloatArray) -> FloatArray:
-    """Covariance (m, 2, 2) of slopes (m, 2) by headings that were a little off when the surface was touched.
+    """Covariance of slopes (m, 2) by headings that were a little off when the surface was touched.
 
     A ridge that was mapped slightly turned has a slope along itself, and would tell a place along it.
+
+    Returns:
+        Its xx, xy and yy, shape (3, m).
     """
-    across = np.column_stack([-slope[:, 1], slope[:, 0]]) * TURN_SIGMA
-    return across[:, :, None] * across[:, None, :]
+    off = slope.T * TURN_SIGMA
+    noise = np.empty((3, len(slope)))
+    np.multiply(off[1], off[1], out=noise[0])
+    np.multiply(off[0], -off[1], out=noise[1])
+    np.multiply(off[0], off[0], out=noise[2])
+    return noise
 
 
 def slope_noise_information(q: FloatArray, pose: FloatArray, slope_noise: FloatArray, weight: FloatArray) -> FloatArray:
-    """What errors of the slopes add to J' W J in the mean, shape (4, 4).
+    """What errors of the slopes add to J' W J in the mean, shape (..., 4, 4).
 
     Args:
-        q: touches on the surface, shape (m, 3), m.
-        pose: of their frame, shape (4,).
-        slope_noise: covariance of the slopes there, shape (m, 2, 2).
-        weight: of the touches, shape (m,).
+        q: touches on the surface, shape (..., m, 3), m.
+        pose: of their frame, shape (..., 4).
+        slope_noise: covariance of the slopes there, its xx, xy and yy, shape (3, ..., m).
+        weight: of the touches, shape (..., m).
     """
-    M = np.zeros((len(q), 2, 3))  # J = slope M
-    M[:, 0, X] = M[:, 1, Y] = -1.0
-    M[:, 0, YAW], M[:, 1, YAW] = q[:, 1] - pose[Y], pose[X] - q[:, 0]
-    added = np.zeros((4, 4))
-    added[:3, :3] = np.einsum("m,mia,mij,mjb->ab", weight, M, slope_noise, M)
+    # J' = M' slope, with M' the rows (-1, 0), (0, -1), (a, b): the sum of w M' C M, entry by entry.
+    a, b = q[..., 1] - pose[..., Y, None], pose[..., X, None] - q[..., 0]
+    xx, xy, yy = slope_noise
+    entries = np.empty((*weight.shape[:-1], 6, weight.shape[-1]))
+    entries[..., 0, :], entries[..., 1, :], entries[..., 2, :] = xx, xy, yy
+    on_a, on_b = xx * a + xy * b, xy * a + yy * b
+    np.negative(on_a, out=entries[..., 3, :])
+    np.negative(on_b, out=entries[..., 4, :])
+    entries[..., 5, :] = a * on_a + b * on_b
+    sums = (entries @ weight[..., None])[..., 0]
+    added = np.zeros((*pose.shape, 4))
+    added[..., :3, :3] = sums[..., [[0, 1, 3], [1, 2, 4], [3, 4, 5]]]
     return added
 
 
 def _less(H: FloatArray, noise: FloatArray) -> FloatArray:
-    """H without what noise adds, and somewhat more, as that is a mean; kept positive semidefinite."""
+    """H (k, 4, 4) without what noise adds, and somewhat more, as that is a mean; kept positive semidefinite."""
     values, vectors = np.linalg.eigh(H)
-    kept = np.einsum("ia,ij,ja->a", vectors, noise, vectors)
-    share = np.clip(1.0 - NOISE_MARGIN * kept / np.maximum(values, 1e-12), 0.0, 1.0)
-    return np.asarray((vectors * (values * share)) @ vectors.T)
+    kept = (vectors * (noise @ vectors)).sum(axis=-2)
+    share = np.minimum(np.maximum(1.0 - NOISE_MARGIN * kept / np.maximum(values, 1e-12), 0.0), 1.0)
+    return np.asarray((vectors * (values * share)[:, None]) @ vectors.transpose(0, 2, 1))
 
 
 def _judged(
     pose: FloatArray,
     H: tuple[FloatArray, FloatArray],
     gradient: FloatArray,
-    patches: SurfacePatches,
+    known: NDArray[np.bool_],
+    variance: FloatArray,
+    height: FloatArray,
     q: FloatArray,
     residual: FloatArray,
 ) -> SurfaceMatch:
-    known = patches.known
-    limit = INLIER_SIGMAS * np.sqrt(patches.variance[known])
-    fits = np.abs(residual) < limit
-    cost = float(np.mean(np.minimum(residual**2, limit**2)))
-    rms = float(np.sqrt(np.mean(residual[fits] ** 2))) if fits.any() else 0.0
-    heights = np.column_stack([q[known, :2], patches.height[known]])
-    return SurfaceMatch(pose, *H, gradient, float(known.mean()), float(fits.mean()), rms, cost, heights)
+    on = np.flatnonzero(known)
+    squared, limit = np.square(residual[on]), INLIER_SIGMAS**2 * variance[on]
+    fits = squared < limit
+    count = int(np.count_nonzero(fits))
+    cost = float(np.minimum(squared, limit).sum()) / len(on)
+    rms = math.sqrt(float(squared @ fits) / count) if count else 0.0
+    heights = np.empty((len(on), 3))
+    heights[:, :2], heights[:, 2] = q[on, :2], height[on]
+    return SurfaceMatch(pose, *H, gradient, len(on) / len(known), count / len(on), rms, cost, heights)
