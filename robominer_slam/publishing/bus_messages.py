@@ -28,11 +28,19 @@ class Received(NamedTuple):
 
 
 class Query(NamedTuple):
-    """A question; `key` as in `Received`."""
+    """A question.
+
+    Attributes:
+        key: as in `Received`.
+        parameters: of its selector.
+        payload: the bytes.
+        sender: who asks, for the log, as far as the links tell (`senders.py`).
+    """
 
     key: str
     parameters: Mapping[str, str]
     payload: bytes
+    sender: str = ""
 
 
 class Reply(NamedTuple):
