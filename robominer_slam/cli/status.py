@@ -17,6 +17,8 @@ from robominer_slam.publishing.report_messages import DIAGNOSTIC_ARRAY, Level
 from robominer_slam.publishing.zenoh_session import ZenohBus
 
 FOLDER = click.Path(file_okay=False, path_type=Path)
+#: A daemon that is there takes the connection at once.
+CONNECT_TIMEOUT_S = 5.0
 #: Keys of the whiskers that are not well, as `status_report.py` writes them: `whisker (row, column)`.
 WHISKER = "whisker "
 COLOURS = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "red", Level.STALE: "magenta"}
@@ -31,7 +33,7 @@ COLOURS = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "red", Level.ST
 def status(connect: str, credentials: Path | None, robot: str, timeout: float, as_json: bool) -> None:
     """What a running daemon says of itself; it speaks once a second, and to remote links in short, each ten seconds."""
     messages: queue.Queue[bytes] = queue.Queue()
-    settings = client_settings(connect, credentials, timeout)
+    settings = client_settings(connect, credentials, min(timeout, CONNECT_TIMEOUT_S))
     with ZenohBus(settings, f"robominer/{robot}") as bus:
         bus.subscriber("status", lambda received: messages.put(received.payload))
         try:
