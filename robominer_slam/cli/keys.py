@@ -69,7 +69,7 @@ def issue(name: str, role: Role, days: int, hosts: tuple[str, ...], replace: boo
     authority = Authority(folder)
     holder = authority.issue(name, role, days, hosts, replace=replace)
     click.echo(
-        f"{name} ({role}) until {holder.expires}: copy {authority.bundle(name)} to its machine, and delete it here"
+        f"{name} ({role}) until {_minutes(holder.expires)}: copy {authority.bundle(name)} to its machine, and delete it here"
     )
     if role == "robot":
         click.echo("in the robot's configuration, [zenoh] credentials names the folder; start the daemon anew")
@@ -92,7 +92,7 @@ def list_(folder: Path, as_json: bool) -> None:
         table.add_column(column)
     for holder in holders:
         state = holder.state(now)
-        table.add_row(holder.name, holder.role, f"[{COLOURS[state]}]{state}[/]", holder.expires, " ".join(holder.hosts))
+        table.add_row(holder.name, holder.role, f"[{COLOURS[state]}]{state}[/]", _minutes(holder.expires), " ".join(holder.hosts))
     Console().print(table)
 
 
@@ -117,6 +117,10 @@ def _say_to_copy_the_list(authority: Authority) -> None:
     for robot in authority.access_list.names(["robot"]):
         path = shlex.quote(str(authority.folder / "access.json"))
         click.echo(f"copy {path} into the credentials folder of {robot}, and start its daemon anew")
+
+
+def _minutes(time: str) -> str:
+    return f"{datetime.fromisoformat(time):%Y-%m-%d %H:%M} UTC"
 
 
 def _described(holder: Holder, now: datetime) -> dict[str, object]:

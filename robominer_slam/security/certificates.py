@@ -76,7 +76,7 @@ def issue(
         raise KeysError("the authority's key is not an elliptic curve's; it was not made by this program")
     start, end = _period(days)
     end = min(end, authority.not_valid_after_utc)
-    if end <= datetime.now(UTC):
+    if authority.not_valid_after_utc <= datetime.now(UTC):
         raise KeysError("the authority itself has expired: robominer-slam keys init --renew")
     key = ec.generate_private_key(ec.SECP256R1())
     subject = x509.Name(
