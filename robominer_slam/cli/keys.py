@@ -68,9 +68,8 @@ def issue(name: str, role: Role, days: int, hosts: tuple[str, ...], replace: boo
     """Make a certificate for NAME, and a bundle to be copied to its machine."""
     authority = Authority(folder)
     holder = authority.issue(name, role, days, hosts, replace=replace)
-    click.echo(
-        f"{name} ({role}) until {_minutes(holder.expires)}: copy {authority.bundle(name)} to its machine, and delete it here"
-    )
+    bundle = authority.bundle(name)
+    click.echo(f"{name} ({role}) until {_minutes(holder.expires)}: copy {bundle} to its machine, and delete it here")
     if role == "robot":
         click.echo("in the robot's configuration, [zenoh] credentials names the folder; start the daemon anew")
     else:
@@ -92,7 +91,9 @@ def list_(folder: Path, as_json: bool) -> None:
         table.add_column(column)
     for holder in holders:
         state = holder.state(now)
-        table.add_row(holder.name, holder.role, f"[{COLOURS[state]}]{state}[/]", _minutes(holder.expires), " ".join(holder.hosts))
+        table.add_row(
+            holder.name, holder.role, f"[{COLOURS[state]}]{state}[/]", _minutes(holder.expires), " ".join(holder.hosts)
+        )
     Console().print(table)
 
 

@@ -17,6 +17,8 @@ from robominer_slam.security.errors import KeysError
 
 #: What the robot offers it says as soon as the link stands; a slow link takes a moment.
 OFFER_S = 3.0
+#: What it offers comes together: after the first, the second is there or will not come.
+NEXT_OFFER_S = 1.0
 
 
 def check_link(connect: str, credentials: Path | None, prefix: str, timeout_s: float) -> Iterator[Finding]:
@@ -57,7 +59,7 @@ def _zenoh(connect: str, credentials: Path | None, prefix: str, timeout_s: float
         with ZenohBus(client_settings(connect, credentials, timeout_s), prefix) as bus:
             yield Finding("Zenoh", "ok", "connected")
             reads = bus.answered("map/snapshot", OFFER_S)
-            commands = bus.answered("cmd/pause", OFFER_S if reads else 0.0)
+            commands = bus.answered("cmd/pause", NEXT_OFFER_S if reads else 0.0)
     except (ZenohSetupError, KeysError) as error:
         yield Finding("Zenoh", "error", str(error), "is it a robominer-slam daemon?")
         return
