@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from drivers.ros_messages import deserialize
-from robominer_slam import layout
+from robominer_slam.layout import to_json
 from robominer_slam.publishing.client_settings import client_settings
 from robominer_slam.publishing.report_messages import DIAGNOSTIC_ARRAY
 from robominer_slam.publishing.zenoh_session import ZenohBus
@@ -20,6 +20,7 @@ from robominer_slam.security.authority import Authority
 from sim_backend.configuration_writer import configuration_text, framed_port, write_calibration
 from sim_backend.demo import program
 from tests.secured_robot import LIMIT_S, PREFIX, Inbox, free_ports
+from tests.simulated_hall_array import small_layout
 
 
 @dataclass
@@ -44,9 +45,11 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     for name, role in (("rm3", "robot"), ("alice", "operator"), ("bob", "viewer")):
         authority.issue(name, role)
     tls, tcp = free_ports(2)
-    write_calibration(folder, layout.BUILT_IN["thesis-grid"](), 1)
+    # Few whiskers: their calibration is not what takes the time here.
+    write_calibration(folder, small_layout(), 1)
+    (folder / "small.json").write_text(to_json(small_layout()))
     text = configuration_text(
-        [framed_port(role, folder / role) for role in ("whiskers", "imu", "screws")], "thesis-grid",
+        [framed_port(role, folder / role) for role in ("whiskers", "imu", "screws")], "small.json",
         ticks_per_turn=1000, mount_rpy_deg=(0.0, 0.0, 0.0), source="fused", method=None, store=folder / "map.db",
         listen=f"tcp/127.0.0.1:{tcp}",
     )  # fmt: skip
