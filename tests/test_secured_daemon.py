@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,11 +13,13 @@ from pathlib import Path
 import pytest
 
 from drivers.ros_messages import deserialize
+from robominer_slam.configuration.file import load
 from robominer_slam.layout import to_json
 from robominer_slam.publishing.client_settings import client_settings
 from robominer_slam.publishing.report_messages import DIAGNOSTIC_ARRAY
 from robominer_slam.publishing.zenoh_session import ZenohBus
 from robominer_slam.security.authority import Authority
+from robominer_slam.service import serve
 from sim_backend.configuration_writer import configuration_text, framed_port, write_calibration
 from sim_backend.demo import program
 from tests.secured_robot import LIMIT_S, PREFIX, Inbox, free_ports
@@ -145,3 +148,32 @@ def test_status_and_doctor_by_tls(daemon: Running):
         )  # fmt: skip
         assert done.returncode == 0, done.stderr + done.stdout
         assert json.loads(done.stdout)
+
+
+def test_an_expired_certificate_is_said_and_the_robot_goes_on(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    authority = Authority.create(tmp_path / "keys")
+    authority.issue("rm3", "robot", 0)
+    authority.issue("spare", "robot")
+    tcp, tls = free_ports(2)
+    for name, expected in (("rm3", 1), ("spare", 0)):
+        caplog.clear()
+        path = tmp_path / f"{name}.toml"
+        path.write_text(
+            f'[robot]\nrole = "drivers"\n[[device]]\nname = "imu"\nport = "{tmp_path / "imu"}"\n'
+            f'[zenoh]\nlisten = ["tcp/127.0.0.1:{tcp}", "tls/127.0.0.1:{tls}"]\ncredentials = "keys/holders/{name}"\n'
+        )
+        stop = threading.Event()
+        thread = threading.Thread(target=serve, args=(load(path), path, stop))
+        thread.start()
+        try:
+            with ZenohBus(client_settings(f"tcp/127.0.0.1:{tcp}", None, LIMIT_S), PREFIX) as local:
+                assert Inbox(local, "status").until(lambda _: True), "the robot speaks"
+            if name == "spare":
+                settings = client_settings(f"tls/localhost:{tls}", authority.bundle("spare"), LIMIT_S)
+                with ZenohBus(settings, PREFIX) as board:
+                    [status] = Inbox(board, "status").until(lambda _: True)
+                    assert len(status.payload) <= 400
+        finally:
+            stop.set()
+            thread.join(LIMIT_S)
+        assert sum("expired at" in record.message for record in caplog.records) == expected
