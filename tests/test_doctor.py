@@ -133,7 +133,7 @@ def test_a_closed_port_an_unknown_name_and_a_port_without_tls(robot: SecuredRobo
         code, found = examine("--connect", place, "--credentials", bundle, "--timeout", "0.5")
     assert code == 1
     assert found["TLS"][0] == "error"
-    code, found = examine("--connect", plain, "--credentials", bundle)
+    code, found = examine("--connect", plain, "--credentials", bundle, "--timeout", "0.5")
     assert code == 1
     assert found["TLS"][0] == "error"
 

@@ -10,9 +10,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import click
 import pytest
+from click.testing import CliRunner
 
 from drivers.ros_messages import deserialize
+from robominer_slam.cli.doctor import doctor
+from robominer_slam.cli.status import status
 from robominer_slam.configuration.file import load
 from robominer_slam.layout import to_json
 from robominer_slam.publishing.client_settings import client_settings
@@ -139,15 +143,12 @@ def test_commands_are_acknowledged_logged_by_name_and_safe_to_repeat(daemon: Run
     assert len(lines) == 2
 
 
-def test_status_and_doctor_by_tls(daemon: Running):
+@pytest.mark.parametrize("command", [status, doctor])
+def test_status_and_doctor_by_tls(daemon: Running, command: click.Command):
     bundle = str(daemon.authority.bundle("bob"))
-    for command in ("status", "doctor"):
-        done = subprocess.run(
-            program(command, "--connect", daemon.tls, "--credentials", bundle, "--json"),
-            capture_output=True, text=True, timeout=60, check=False,
-        )  # fmt: skip
-        assert done.returncode == 0, done.stderr + done.stdout
-        assert json.loads(done.stdout)
+    done = CliRunner().invoke(command, ["--connect", daemon.tls, "--credentials", bundle, "--json"])
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.output)
 
 
 def test_an_expired_certificate_is_said_and_the_robot_goes_on(tmp_path: Path, caplog: pytest.LogCaptureFixture):
@@ -171,8 +172,8 @@ def test_an_expired_certificate_is_said_and_the_robot_goes_on(tmp_path: Path, ca
             if name == "spare":
                 settings = client_settings(f"tls/localhost:{tls}", authority.bundle("spare"), LIMIT_S)
                 with ZenohBus(settings, PREFIX) as board:
-                    [status] = Inbox(board, "status").until(lambda _: True)
-                    assert len(status.payload) <= 400
+                    [message] = Inbox(board, "status").until(lambda _: True)
+                    assert len(message.payload) <= 400
         finally:
             stop.set()
             thread.join(LIMIT_S)

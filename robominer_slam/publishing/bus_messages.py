@@ -56,3 +56,9 @@ class QueryRefusedError(Exception):
 
 class QueryError(Exception):
     """Nobody answered a query, or all who did answered with an error."""
+
+
+def parameters_of(text: str) -> dict[str, str]:
+    """Parameters of a selector; by hand, as the binding's own iteration is not what its types declare."""
+    pairs = (part.partition("=") for part in text.split(";") if part)
+    return {name: value for name, _, value in pairs}

@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import zenoh
+
 LOCAL = "a program on the robot"
 
 
@@ -41,3 +43,10 @@ def sender(peers: Sequence[Peer], claimed: str | None) -> str:
     if not different:
         return f"Zenoh id {claimed}" if claimed else "unknown"
     return f"one of {', '.join(different)}"
+
+
+def own_source(session: zenoh.Session, key: str) -> zenoh.SourceInfo:
+    """Who we are, to go with a command: where several may command, the robot's log tells them apart by it."""
+    # Only what is declared has an identity that can be told.
+    with session.declare_querier(key) as querier:
+        return zenoh.SourceInfo(querier.id, 0)

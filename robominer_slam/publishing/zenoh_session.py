@@ -11,9 +11,9 @@ from typing import TypeAlias
 import zenoh
 from zenoh import ext
 
-from robominer_slam.publishing.bus_messages import Query, QueryError, QueryRefusedError, Received, Reply
+from robominer_slam.publishing.bus_messages import Query, QueryError, QueryRefusedError, Received, Reply, parameters_of
 from robominer_slam.publishing.keys import Qos, encoding_of, qos_of
-from robominer_slam.publishing.senders import Peer, sender
+from robominer_slam.publishing.senders import Peer, own_source, sender
 from robominer_slam.publishing.zenoh_settings import ZenohSettings, ZenohSetupError, open_session
 
 __all__ = [
@@ -225,7 +225,7 @@ class ZenohBus:
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=timeout_s,
             payload=payload,
-            source_info=self._source_info(key),
+            source_info=own_source(self._session, self._full(key)) if key.startswith("cmd/") else None,
         )
         received: list[Received] = []
         errors: list[str] = []
@@ -245,7 +245,7 @@ class ZenohBus:
         payload = b"" if query.payload is None else query.payload.to_bytes()
         claimed = None if query.source_info is None else str(query.source_info.source_id.zid)
         who = sender(self._peers(), claimed) if asked.startswith("cmd/") else ""
-        found = callback(Query(asked, _parameters(query), payload, who))
+        found = callback(Query(asked, parameters_of(str(query.parameters)), payload, who))
         replies = [found] if isinstance(found, Reply) else found
         for reply in replies:
             encoding = encoding_of(asked) if reply.encoding is None else reply.encoding
@@ -255,14 +255,6 @@ class ZenohBus:
         """Who may have sent a command."""
         peers = (Peer(str(link.zid), link.auth_identifier) for link in self._session.info.links())
         return [peer for peer in peers if peer.name is None or peer.name in self._commanders]
-
-    def _source_info(self, key: str) -> zenoh.SourceInfo | None:
-        """With a command goes who we are: where several may command, the robot's log then tells them apart."""
-        if not key.startswith("cmd/"):
-            return None
-        # Only what is declared has an identity that can be told.
-        with self._session.declare_querier(self._full(key)) as querier:
-            return zenoh.SourceInfo(querier.id, 0)
 
     def _publisher(self, key: str, qos: Qos | None) -> _Publisher:
         with self._lock:
@@ -301,9 +293,3 @@ class ZenohBus:
         attachment = None if sample.attachment is None else sample.attachment.to_bytes()
         key = self._relative(str(sample.key_expr))
         return Received(key, sample.payload.to_bytes(), str(sample.encoding), attachment)
-
-
-def _parameters(query: zenoh.Query) -> dict[str, str]:
-    """Split by hand: the binding's own iteration is declared as a list of pairs, but gives an iterator."""
-    pairs = (part.partition("=") for part in str(query.parameters).split(";") if part)
-    return {name: value for name, _, value in pairs}
