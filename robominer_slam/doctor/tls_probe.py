@@ -19,7 +19,10 @@ _HOST, _ADDRESS = 62, 64
 #: What the server said of the client's certificate, by OpenSSL's names of the alerts.
 _ALERTS = {
     "CERTIFICATE_REQUIRED": ("the robot asks for a certificate, and got none", "give --credentials FOLDER"),
-    "CERTIFICATE_EXPIRED": ("the robot refuses your certificate: expired", "keys issue NAME --role ROLE --replace"),
+    "CERTIFICATE_EXPIRED": (
+        "the robot refuses your certificate: expired",
+        "robominer-slam keys issue NAME --role ROLE --replace",
+    ),
     "UNKNOWN_CA": (
         "the robot refuses your certificate: of an authority that it does not know",
         "copy your new bundle from the authority of this robot",
