@@ -49,7 +49,7 @@ class Commands:
         self._store = store
         self._new_map = new_map
         self._relocalisation = relocalisation
-        self._answers: OrderedDict[str, bytes] = OrderedDict()
+        self._answers: OrderedDict[tuple[str, str], bytes] = OrderedDict()
         self.handlers: dict[str, Callable[[Mapping[str, str]], str]] = {
             "pause": self._pause,
             "resume": self._resume,
@@ -63,8 +63,11 @@ class Commands:
         """Answer one `cmd/<name>` query."""
         name = query.key.rsplit("/", 1)[-1]
         identity = query.parameters.get("id", "")
-        if identity and identity in self._answers:
-            return [Reply(self._answers[identity])]
+        # An id that comes again with another command is another command: its answer must not be taken for this one's.
+        repeat = (name, identity)
+        if identity and repeat in self._answers:
+            log.info("command %s %s from %s: repeated, answered as before", name, identity, query.sender)
+            return [Reply(self._answers[repeat])]
         try:
             handler = self.handlers.get(name)
             if handler is None:
@@ -72,10 +75,10 @@ class Commands:
             answer = {"ok": True, "message": handler(query.parameters)}
         except CommandError as error:
             answer = {"ok": False, "message": str(error)}
-        log.info("command %s %s: %s", name, dict(query.parameters), answer["message"])
+        log.info("command %s %s from %s: %s", name, dict(query.parameters), query.sender, answer["message"])
         payload = json.dumps(answer).encode()
         if identity:
-            self._answers[identity] = payload
+            self._answers[repeat] = payload
             while len(self._answers) > REMEMBERED:
                 self._answers.popitem(last=False)
         return [Reply(payload)]

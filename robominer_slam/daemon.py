@@ -26,6 +26,7 @@ from robominer_slam.publishing.bus_messages import Query, Reply
 from robominer_slam.publishing.report_messages import Diagnostic
 from robominer_slam.publishing.telemetry import Health
 from robominer_slam.publishing.zenoh_session import ZenohBus
+from robominer_slam.remote_status import RemoteStatus, short_status
 from robominer_slam.slam.saved_map import SavedMap
 from robominer_slam.sources.source import MeasurementSource
 from robominer_slam.store import MapStore
@@ -70,6 +71,7 @@ class Daemon:
         slam = configuration.slam
         relocalisation = slam.robust.relocalisation if slam.method == "robust" else None
         self._commands = Commands(self._pipeline, self._map, store, self._new_map, relocalisation)
+        self._remote_status = RemoteStatus()
         self._last_frame: FrameResult | None = None
         self._telemetry_ns = self._status_ns = self._telemetry_count = 0
         self._declare_queries()
@@ -135,7 +137,11 @@ class Daemon:
             return
         self._status_ns = now
         stamp = self._clock.unix_ns(now)
-        self._bus.put("status", report_messages.diagnostics(stamp, self._diagnostics(now)))
+        entries = self._diagnostics(now)
+        self._bus.put("status", report_messages.diagnostics(stamp, entries))
+        # At once: links within the machine tell the short one by that, and drop it (tls_settings.py).
+        if self._bus.remote and self._remote_status.due(now, entries, self._bus.remote_links()):
+            self._bus.put("status", short_status(stamp, entries))
 
     def _diagnostics(self, now_ns: int) -> list[Diagnostic]:
         frame = self._last_frame

@@ -9,6 +9,7 @@ import time
 from robominer_slam import status_report
 from robominer_slam.publishing import report_messages
 from robominer_slam.publishing.zenoh_session import ZenohBus
+from robominer_slam.remote_status import RemoteStatus, short_status
 from robominer_slam.sources.source import MeasurementSource
 from robominer_slam.sources.zenoh_source import publish_raw
 from robominer_slam.wall_clock import WallClock
@@ -22,6 +23,7 @@ WAIT_S = 0.1
 def forward(source: MeasurementSource, bus: ZenohBus, stop: threading.Event) -> None:
     """Publish every measurement on `raw/<device>` and the devices' state on `status`, until `stop` is set."""
     clock = WallClock()
+    remote_status = RemoteStatus()
     forwarded = 0
     next_status = time.monotonic()
     while not stop.is_set():
@@ -33,5 +35,8 @@ def forward(source: MeasurementSource, bus: ZenohBus, stop: threading.Event) -> 
             next_status += STATUS_INTERVAL_S
             entries = [status_report.process_diagnostic(clock, source.dropped)]
             entries += [status_report.device_diagnostic(device) for device in source.status()]
-            bus.put("status", report_messages.diagnostics(clock.now_unix_ns(), entries))
+            stamp = clock.now_unix_ns()
+            bus.put("status", report_messages.diagnostics(stamp, entries))
+            if bus.remote and remote_status.due(time.monotonic_ns(), entries, bus.remote_links()):
+                bus.put("status", short_status(stamp, entries))
     log.info("ended after %d measurements", forwarded)

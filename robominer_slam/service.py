@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import threading
+from datetime import UTC, datetime
 from pathlib import Path
 
 from drivers.serial_reader import SerialReader
@@ -13,12 +15,17 @@ from robominer_slam.configuration.file import ConfigurationError
 from robominer_slam.configuration.model import Configuration
 from robominer_slam.daemon import Daemon
 from robominer_slam.drivers_daemon import forward
-from robominer_slam.publishing.zenoh_session import ZenohBus, ZenohSettings
+from robominer_slam.publishing.robot_settings import robot_settings
+from robominer_slam.publishing.zenoh_session import ZenohBus
+from robominer_slam.security.credentials import load_credentials
+from robominer_slam.security.inspection import inspect
 from robominer_slam.sources.source import MeasurementSource
 from robominer_slam.sources.zenoh_source import ZenohSource
 from robominer_slam.store import MapStore
 from robominer_slam.store_reader import map_to_start_in
 from robominer_slam.wall_clock import WallClock
+
+log = logging.getLogger(__name__)
 
 
 def serve(configuration: Configuration, config_file: Path, stop: threading.Event) -> None:
@@ -35,8 +42,10 @@ def serve(configuration: Configuration, config_file: Path, stop: threading.Event
     robot, folder = configuration.robot, config_file.parent
     if robot.role != "slam" and not configuration.device:
         raise ConfigurationError(f"{config_file}: device: missing; expected a [[device]] for each port")
-    settings = ZenohSettings(listen=configuration.zenoh.listen, connect=configuration.zenoh.connect)
     prefix = f"robominer/{robot.id}"
+    settings = robot_settings(configuration.zenoh, folder, prefix)
+    if configuration.zenoh.credentials is not None:
+        _say_if_expired(folder / configuration.zenoh.credentials)
     with contextlib.ExitStack() as stack:
         if robot.role == "drivers":
             reader = SerialReader(device_settings(configuration))
@@ -55,3 +64,14 @@ def serve(configuration: Configuration, config_file: Path, stop: threading.Event
         )
         stack.enter_context(source)
         Daemon(configuration, array, source, bus, store, known).run(stop)
+
+
+def _say_if_expired(credentials: Path) -> None:
+    """An expired certificate keeps remote users out, but never the robot from working.
+
+    Raises:
+        KeysError: a certificate that does not belong to its key or its authority.
+    """
+    facts = inspect(load_credentials(credentials))
+    if facts.ends <= datetime.now(UTC):
+        log.error("the certificate of %s expired at %s: nobody can connect by TLS; run doctor", facts.name, facts.ends)

@@ -119,6 +119,27 @@ def test_io_imports_no_algorithms():
             assert not used & algorithms, f"{path.relative_to(ROOT)} imports {used & algorithms}"
 
 
+def test_keys_know_nothing_of_slam():
+    allowed = {
+        "robominer_slam.security",
+        "robominer_slam.publishing",
+        "robominer_slam.configuration",
+        "robominer_slam.doctor",
+    }
+    for place in ("robominer_slam/security", "robominer_slam/doctor"):
+        for path in files(place):
+            used = {".".join(name.split(".")[:2]) for name in imports(path) if name.startswith("robominer_slam.")}
+            assert used <= allowed, f"{path.relative_to(ROOT)} imports {used - allowed}"
+
+
+def test_the_robot_needs_no_cryptography():
+    """Only who issues keys does; `certificates.py` is imported when a certificate is made."""
+    for package in PACKAGES:
+        for path in files(package):
+            if path.name != "certificates.py":
+                assert "cryptography" not in packages_of(imports(path)), path
+
+
 def test_the_simulator_shares_no_code_with_the_decoders():
     decoders = (
         "drivers.framed", "drivers.readings", "drivers.decoders", "drivers.rm3_", "drivers.bno08x_rvc", "drivers.mip",

@@ -10,6 +10,7 @@ import pytest
 
 from drivers.ros_messages import deserialize, header, serialize
 from robominer_slam.publishing import keys
+from robominer_slam.publishing.senders import LOCAL
 from robominer_slam.publishing.zenoh_session import (
     Query,
     QueryError,
@@ -111,7 +112,7 @@ def test_a_query_is_answered_with_its_parameters_and_payload(robot: ZenohBus, co
     robot.queryable("cmd/save_map", answer)
     [reply] = ask(console, "cmd/save_map", {"name": "level 2", "id": "7"}, b"body")
     assert reply == Received("cmd/save_map", b'{"ok": true, "message": "saved"}', "application/json", None)
-    assert asked[-1] == Query("cmd/save_map", {"name": "level 2", "id": "7"}, b"body")
+    assert asked[-1] == Query("cmd/save_map", {"name": "level 2", "id": "7"}, b"body", LOCAL)
 
 
 def ask(

@@ -20,6 +20,7 @@ from robominer_slam.evaluation.run_record import ResultsError
 from robominer_slam.evaluation.trajectory import TrajectoryError
 from robominer_slam.layout import LayoutError
 from robominer_slam.publishing.zenoh_session import ZenohSetupError
+from robominer_slam.security.errors import KeysError
 from robominer_slam.store_database import StoreError
 
 #: Errors that are the user's to mend; anything else is ours and shows a traceback.
@@ -28,6 +29,7 @@ USER_ERRORS = (
     CaptureError,
     ConfigurationError,
     FitError,
+    KeysError,
     LayoutError,
     PortNameError,
     RecordingError,
@@ -41,8 +43,10 @@ USER_ERRORS = (
 COMMANDS = {
     "calibrate": "robominer_slam.cli.calibrate:calibrate",
     "decode": "robominer_slam.cli.decode:decode",
+    "doctor": "robominer_slam.cli.doctor:doctor",
     "evaluate": "robominer_slam.cli.evaluate:evaluate",
     "graph": "robominer_slam.cli.graph:graph",
+    "keys": "robominer_slam.cli.keys:keys",
     "replay": "robominer_slam.cli.replay:replay",
     "run": "robominer_slam.cli.run:run",
     "status": "robominer_slam.cli.status:status",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import queue
+from pathlib import Path
 from typing import Any
 
 import click
@@ -11,9 +12,13 @@ from rich.console import Console
 from rich.table import Table
 
 from drivers.ros_messages import deserialize
+from robominer_slam.publishing.client_settings import client_settings
 from robominer_slam.publishing.report_messages import DIAGNOSTIC_ARRAY, Level
-from robominer_slam.publishing.zenoh_session import ZenohBus, ZenohSettings
+from robominer_slam.publishing.zenoh_session import ZenohBus
 
+FOLDER = click.Path(file_okay=False, path_type=Path)
+#: A daemon that is there takes the connection at once.
+CONNECT_TIMEOUT_S = 5.0
 #: Keys of the whiskers that are not well, as `status_report.py` writes them: `whisker (row, column)`.
 WHISKER = "whisker "
 COLOURS = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "red", Level.STALE: "magenta"}
@@ -21,20 +26,22 @@ COLOURS = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "red", Level.ST
 
 @click.command(epilog="Example: robominer-slam status --connect tcp/127.0.0.1:7447")
 @click.option("--connect", default="tcp/127.0.0.1:7447", show_default=True, help="Endpoint of the daemon.")
+@click.option("--credentials", type=FOLDER, help="Folder with your bundle from `keys issue`, for tls/ endpoints.")
 @click.option("--robot", default="rm3", show_default=True, help="The robot's id.")
-@click.option("--timeout", default=5.0, show_default=True, help="How long to wait for an answer, s.")
+@click.option("--timeout", default=12.0, show_default=True, help="How long to wait for an answer, s.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def status(connect: str, robot: str, timeout: float, as_json: bool) -> None:
-    """What a running daemon says of itself; it speaks once a second."""
+def status(connect: str, credentials: Path | None, robot: str, timeout: float, as_json: bool) -> None:
+    """What a running daemon says of itself; it speaks once a second, and to remote links in short, each ten seconds."""
     messages: queue.Queue[bytes] = queue.Queue()
-    settings = ZenohSettings(connect=(connect,), mode="client", connect_timeout_s=timeout)
+    settings = client_settings(connect, credentials, min(timeout, CONNECT_TIMEOUT_S))
     with ZenohBus(settings, f"robominer/{robot}") as bus:
         bus.subscriber("status", lambda received: messages.put(received.payload))
         try:
             payload = messages.get(timeout=timeout)
         except queue.Empty:
             raise click.ClickException(
-                f"nothing on robominer/{robot}/status within {timeout:g} s: is the robot's id right?"
+                f"nothing on robominer/{robot}/status within {timeout:g} s: is the robot's id right, "
+                "and is your name on its access list?"
             ) from None
     entries: list[Any] = list(deserialize(payload, DIAGNOSTIC_ARRAY).status)
     if as_json:

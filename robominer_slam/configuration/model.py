@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, ValidationInfo, field_validator
 
 from robominer_slam.configuration.device_section import DeviceSection
 from robominer_slam.configuration.parameter import KeyChunk, Section, parameter
 from robominer_slam.configuration.robust_estimation_section import RobustEstimationSection
 from robominer_slam.configuration.robust_slam_section import RobustSlamSection
+from robominer_slam.security.endpoints import check
 
 
 class RobotSection(Section):
@@ -252,11 +253,24 @@ class StoreSection(Section):
 class ZenohSection(Section):
     """The network."""
 
-    listen: tuple[str, ...] = parameter(
-        ("tcp/127.0.0.1:7447",), "", "endpoints to listen on; loopback unless keys are configured"
+    credentials: str | None = parameter(
+        None, "", "folder with the robot's bundle from `keys issue`; without it nothing leaves the machine"
     )
-    connect: tuple[str, ...] = parameter((), "", "endpoints to connect to")
+    listen: tuple[str, ...] = parameter(
+        ("tcp/127.0.0.1:7447",), "", "endpoints to listen on: loopback, and with credentials tls/0.0.0.0:7448"
+    )
+    connect: tuple[str, ...] = parameter((), "", "endpoints to connect to: loopback, and with credentials tls/")
+    remote_ros: bool = parameter(
+        False, "", "send ROS topics on TLS links at full rate: half a Mbit/s, too much for a slow one"
+    )
     ros: Literal["none"] = parameter("none", "", "what ROS 2 bridges need in addition")
+
+    @field_validator("listen", "connect")
+    @classmethod
+    def _nothing_leaves_unprotected(cls, value: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
+        for endpoint in value:
+            check(endpoint, credentials=bool(info.data.get("credentials")))
+        return value
 
 
 class Configuration(Section):

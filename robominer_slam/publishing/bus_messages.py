@@ -28,11 +28,19 @@ class Received(NamedTuple):
 
 
 class Query(NamedTuple):
-    """A question; `key` as in `Received`."""
+    """A question.
+
+    Attributes:
+        key: as in `Received`.
+        parameters: of its selector.
+        payload: the bytes.
+        sender: who asks, for the log, as far as the links tell (`senders.py`).
+    """
 
     key: str
     parameters: Mapping[str, str]
     payload: bytes
+    sender: str = ""
 
 
 class Reply(NamedTuple):
@@ -48,3 +56,9 @@ class QueryRefusedError(Exception):
 
 class QueryError(Exception):
     """Nobody answered a query, or all who did answered with an error."""
+
+
+def parameters_of(text: str) -> dict[str, str]:
+    """Parameters of a selector; by hand, as the binding's own iteration is not what its types declare."""
+    pairs = (part.partition("=") for part in text.split(";") if part)
+    return {name: value for name, _, value in pairs}

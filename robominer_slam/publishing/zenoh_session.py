@@ -11,8 +11,9 @@ from typing import TypeAlias
 import zenoh
 from zenoh import ext
 
-from robominer_slam.publishing.bus_messages import Query, QueryError, QueryRefusedError, Received, Reply
+from robominer_slam.publishing.bus_messages import Query, QueryError, QueryRefusedError, Received, Reply, parameters_of
 from robominer_slam.publishing.keys import Qos, encoding_of, qos_of
+from robominer_slam.publishing.senders import Peer, own_source, sender
 from robominer_slam.publishing.zenoh_settings import ZenohSettings, ZenohSetupError, open_session
 
 __all__ = [
@@ -40,6 +41,10 @@ class ZenohBus:
     """A session and what is declared on it; use it with `with`. Safe to use from several threads.
 
     Keys are relative to the prefix. Callbacks run in threads of Zenoh's; what they raise is logged.
+
+    Attributes:
+        prefix: `robominer/<robot id>`.
+        remote: whether there may be TLS links.
     """
 
     def __init__(self, settings: ZenohSettings, prefix: str) -> None:
@@ -53,6 +58,8 @@ class ZenohBus:
             ZenohSetupError: an endpoint that cannot be listened on or connected to.
         """
         self.prefix = prefix.strip("/")
+        self.remote = settings.remote
+        self._commanders = settings.commanders
         self._session = open_session(settings)
         self._lock = threading.Lock()
         self._publishers: dict[str, _Publisher] = {}
@@ -83,6 +90,21 @@ class ZenohBus:
     def links(self) -> int:
         """Number of others that this session is connected to."""
         return len(list(self._session.info.transports()))
+
+    def remote_links(self) -> frozenset[str]:
+        """Others that are connected by TLS, by their Zenoh id."""
+        return frozenset(str(link.zid) for link in self._session.info.links() if link.auth_identifier is not None)
+
+    def answered(self, key: str, timeout_s: float) -> bool:
+        """Whether somebody answers queries of a key, and shows it to us; nothing is asked."""
+        known = threading.Event()
+        with self._session.declare_querier(self._full(key)) as querier:
+            listener = querier.declare_matching_listener(lambda status: known.set() if status.matching else None)
+            # Zenoh's stubs leave this method without a return type.
+            end_listening: Callable[[], None] = listener.undeclare
+            found = bool(getattr(querier.matching_status, "matching", False)) or known.wait(timeout_s)
+            end_listening()
+        return found
 
     def put(
         self,
@@ -199,7 +221,11 @@ class ZenohBus:
         selector = self._full(key) + (f"?{text}" if text else "")
         # Several answers on one key are parts of one answer, not versions of it: keep all.
         replies = self._session.get(
-            selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=timeout_s, payload=payload
+            selector,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=timeout_s,
+            payload=payload,
+            source_info=own_source(self._session, self._full(key)) if key.startswith("cmd/") else None,
         )
         received: list[Received] = []
         errors: list[str] = []
@@ -217,11 +243,18 @@ class ZenohBus:
         # A query with wildcards is answered on the key that was declared, if that has none itself.
         asked = self._relative(str(query.key_expr)) if "*" in key else key
         payload = b"" if query.payload is None else query.payload.to_bytes()
-        found = callback(Query(asked, _parameters(query), payload))
+        claimed = None if query.source_info is None else str(query.source_info.source_id.zid)
+        who = sender(self._peers(), claimed) if asked.startswith("cmd/") else ""
+        found = callback(Query(asked, parameters_of(str(query.parameters)), payload, who))
         replies = [found] if isinstance(found, Reply) else found
         for reply in replies:
             encoding = encoding_of(asked) if reply.encoding is None else reply.encoding
             query.reply(self._full(asked), reply.payload, encoding=encoding)
+
+    def _peers(self) -> list[Peer]:
+        """Who may have sent a command."""
+        peers = (Peer(str(link.zid), link.auth_identifier) for link in self._session.info.links())
+        return [peer for peer in peers if peer.name is None or peer.name in self._commanders]
 
     def _publisher(self, key: str, qos: Qos | None) -> _Publisher:
         with self._lock:
@@ -260,9 +293,3 @@ class ZenohBus:
         attachment = None if sample.attachment is None else sample.attachment.to_bytes()
         key = self._relative(str(sample.key_expr))
         return Received(key, sample.payload.to_bytes(), str(sample.encoding), attachment)
-
-
-def _parameters(query: zenoh.Query) -> dict[str, str]:
-    """Split by hand: the binding's own iteration is declared as a list of pairs, but gives an iterator."""
-    pairs = (part.partition("=") for part in str(query.parameters).split(";") if part)
-    return {name: value for name, _, value in pairs}

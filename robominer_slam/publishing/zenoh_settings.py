@@ -33,6 +33,8 @@ class ZenohSettings:
         max_message_bytes: larger messages are refused on receiving.
         connect_timeout_s: how long opening waits for a connection: None: a peer goes on and keeps trying, a
             client fails at once.
+        remote: whether TLS links are to be served, with their short `status`.
+        commanders: names in certificates whose holders may send commands.
         further: more of Zenoh's configuration, path to value, such as TLS and access control.
     """
 
@@ -41,6 +43,8 @@ class ZenohSettings:
     mode: Literal["peer", "client"] = "peer"
     max_message_bytes: int = MAX_MESSAGE_BYTES
     connect_timeout_s: float | None = None
+    remote: bool = False
+    commanders: tuple[str, ...] = ()
     further: Mapping[str, object] = field(default_factory=dict)
 
 
@@ -89,7 +93,12 @@ def open_session(settings: ZenohSettings) -> zenoh.Session:
         reason = _reason(error)
     if settings.mode == "client":
         where = ", ".join(settings.connect) or "nothing"
-        raise ZenohSetupError(f"[zenoh] cannot connect to {where}: {reason}; is the robot's program running?")
+        if any(endpoint.startswith("tls/") for endpoint in settings.connect):
+            # Zenoh does not tell a refused certificate from a robot that is not there.
+            hint = "ask `robominer-slam doctor --connect ENDPOINT --credentials FOLDER` why"
+        else:
+            hint = "is the robot's program running?"
+        raise ZenohSetupError(f"[zenoh] cannot connect to {where}: {reason}; {hint}")
     if "ddress already in use" in reason:
         where = ", ".join(settings.listen)
         raise ZenohSetupError(f"[zenoh] listen {where}: another program listens there; is the daemon running already?")

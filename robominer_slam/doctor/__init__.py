@@ -1,0 +1,1 @@
+"""What is wrong with configuration, keys and connection, and the command that mends it."""
