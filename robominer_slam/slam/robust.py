@@ -41,6 +41,12 @@ HEIGHT_WALK = 0.002
 HEIGHT_SIGMA = 0.003
 #: A patch as a whole is about its middle: of the drift from its oldest to its newest keyframe it has half.
 PATCH_SHARE = 0.5
+#: Median of chi-square with three degrees of freedom: of closures whose covariances are right.
+CHI2_MEDIAN = 2.366
+#: Fewer closures do not tell whether their covariances are too wide.
+LEAST_LIKES = 10
+#: A closure within its own sigma contradicts nobody.
+LEAST_LIMIT = 1.0
 
 
 class RobustBackend:
@@ -269,7 +275,7 @@ class RobustBackend:
         if not large and len(graph.nodes) > bounds.local_window:
             graph.optimise_window(bounds.local_window)
             edges = graph.edges
-            contradicted = edges.loop & edges.enabled & (edges.chi2 > self._parameters.closure.take_back)
+            contradicted = edges.loop & edges.enabled & (edges.chi2 > self._limit())
             if not contradicted.any():
                 self._tracked.closed(len(accepted), self._parameters.closure.max_sigma)
                 return
@@ -284,11 +290,25 @@ class RobustBackend:
         moved, turned = float(np.hypot(off[0], off[1])), abs(float(off[2]))
         return moved > bounds.local_distance or turned > np.deg2rad(bounds.local_angle_deg)
 
+    def _limit(self) -> float:
+        """Chi-square beyond which a closure is contradicted.
+
+        Where the closures as a whole fit better than their covariances say, these are too wide, and one that stands
+        out among its likes is wrong though its own covariance would allow for it: the limit shrinks with the median.
+        """
+        edges, take_back = self._graph.edges, self._parameters.closure.take_back
+        on = edges.loop & edges.enabled
+        if int(on.sum()) < LEAST_LIKES:
+            return take_back
+        spread = float(np.median(edges.chi2[on])) / CHI2_MEDIAN
+        return min(take_back, max(take_back * spread, LEAST_LIMIT))
+
     def _optimise_whole(self) -> None:
         """Optimise; take back what the optimum contradicts, let return what it no longer does; until that settles."""
-        limit, edges = self._parameters.closure.take_back, self._graph.edges
+        edges = self._graph.edges
         for _ in range(4):
             self._graph.optimise()
+            limit = self._limit()
             on = edges.loop & edges.enabled
             worst = float(edges.chi2[on].max(initial=0.0))
             if worst > limit:
