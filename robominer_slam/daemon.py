@@ -65,9 +65,8 @@ class Daemon:
         self._carries = {one.name: one.carries for one in device_settings(configuration)}
         self._pipeline = build_pipeline(configuration, array.layout, array.model, "threaded", known, store.folder)
         self._map = KeyframeMap(configuration.map.point_voxel)
-        section = configuration.map
         self._publisher = Publisher(bus, self._clock, array.layout)
-        self._map_service = MapService(bus, self._clock, self._map, section.grid_cell, section.obstacle_height)
+        self._map_service = MapService(bus, self._clock, self._map, configuration.map)
         slam = configuration.slam
         relocalisation = slam.robust.relocalisation if slam.method == "robust" else None
         self._commands = Commands(self._pipeline, self._map, store, self._new_map, relocalisation)
@@ -178,7 +177,7 @@ class Daemon:
     def _declare_queries(self) -> None:
         service = self._map_service
         handlers: dict[str, Callable[[Query], list[Reply]]] = {
-            "map/snapshot": lambda _: service.snapshot(),
+            "map/snapshot": service.snapshot,
             "map/cloud": lambda _: service.cloud(),
             "map/grid": lambda _: service.grid(),
             "map/graph": lambda _: service.graph(),

@@ -7,19 +7,24 @@ import secrets
 import numpy as np
 
 from robominer_slam import geometry
+from robominer_slam.configuration.model import MapSection
 from robominer_slam.frame_result import FrameResult
 from robominer_slam.graph_json import graph_json
 from robominer_slam.mapping.height_grid import GridSizeError, height_grid, occupancy
 from robominer_slam.mapping.keyframe_map import KeyframeMap
 from robominer_slam.publisher import MAP
 from robominer_slam.publishing import cloud_messages, pose_messages, report_messages
-from robominer_slam.publishing.bus_messages import QueryRefusedError, Reply
+from robominer_slam.publishing.bus_messages import Query, QueryRefusedError, Reply
 from robominer_slam.publishing.map_stream import MapStreamEncoder
 from robominer_slam.publishing.zenoh_session import ZenohBus
 from robominer_slam.slam.saved_map import SavedMap
 from robominer_slam.wall_clock import WallClock
 
 PATH_INTERVAL_NS = 1_000_000_000
+#: Of an answer to a query: well below what receivers refuse (1 MiB).
+MAX_PAYLOAD_BYTES = 512 * 1024
+#: Parameters that name a receiver's copy of the map.
+COPY = ("map_id", "epoch", "since")
 
 
 class MapService:
@@ -29,19 +34,15 @@ class MapService:
         bus: to publish on.
         clock: for stamps.
         keyframe_map: the map; this is the only place that changes it.
-        grid_cell: of the occupancy grid, m.
-        obstacle_height: see `height_grid.occupancy`, m.
+        section: cells of what is published.
     """
 
-    def __init__(
-        self, bus: ZenohBus, clock: WallClock, keyframe_map: KeyframeMap, grid_cell: float, obstacle_height: float
-    ) -> None:
+    def __init__(self, bus: ZenohBus, clock: WallClock, keyframe_map: KeyframeMap, section: MapSection) -> None:
         self.keyframe_map = keyframe_map
         self._bus = bus
         self._clock = clock
-        self._grid_cell = grid_cell
-        self._obstacle_height = obstacle_height
-        self._stream = MapStreamEncoder(secrets.randbits(64))
+        self._section = section
+        self._stream = MapStreamEncoder(secrets.randbits(64), section.stream_cell)
         self._path_ns: int | None = None
         self._path_version = 0
 
@@ -71,7 +72,7 @@ class MapService:
     def new_map(self) -> None:
         """Start anew with an empty map, under another id."""
         self.keyframe_map.clear()
-        self._stream = MapStreamEncoder(secrets.randbits(64))
+        self._stream = MapStreamEncoder(secrets.randbits(64), self._section.stream_cell)
         self._publish_updates()
 
     @property
@@ -84,9 +85,29 @@ class MapService:
         stamps = [self._clock.unix_ns(k.stamp_ns) for k in self.keyframe_map.keyframes]
         return pose_messages.path(stamp_ns, MAP, stamps, geometry.to_vector7(self.keyframe_map.poses))
 
-    def snapshot(self) -> list[Reply]:
-        """The whole stream state, in messages of a few KB."""
-        return [Reply(payload) for payload in self._stream.snapshot_payloads()]
+    def snapshot(self, query: Query) -> list[Reply]:
+        """The whole stream state, or with `map_id=`, `epoch=` and `since=` what a copy of that version lacks.
+
+        Raises:
+            QueryRefusedError: a parameter that is no number.
+        """
+        known = {name: query.parameters[name] for name in COPY if name in query.parameters}
+        if not known:
+            return self._replies(self._stream.snapshot())
+        if known.keys() != set(COPY) or not all(text.isdecimal() for text in known.values()):
+            raise QueryRefusedError(f"expected whole numbers in {'=, '.join(COPY)}=, or none of them")
+        changes = self._stream.changes(*(int(known[name]) for name in COPY))
+        return self._replies(self._stream.snapshot() if changes is None else changes)
+
+    @staticmethod
+    def _replies(messages: list[bytes]) -> list[Reply]:
+        """Messages concatenated: one reply but for large maps."""
+        payloads = [b""]
+        for message in messages:
+            if len(payloads[-1]) + len(message) > MAX_PAYLOAD_BYTES:
+                payloads.append(b"")
+            payloads[-1] += message
+        return [Reply(payload) for payload in payloads]
 
     def cloud(self) -> list[Reply]:
         """PointCloud2 of the map."""
@@ -95,10 +116,10 @@ class MapService:
     def grid(self) -> list[Reply]:
         """OccupancyGrid: steps as obstacles."""
         try:
-            grid = height_grid(self.keyframe_map.cloud(), self._grid_cell)
+            grid = height_grid(self.keyframe_map.cloud(), self._section.grid_cell)
         except GridSizeError as error:
             raise QueryRefusedError(str(error)) from error
-        cells = np.ascontiguousarray(occupancy(grid, self._obstacle_height))
+        cells = np.ascontiguousarray(occupancy(grid, self._section.obstacle_height))
         message = report_messages.occupancy_grid(self._clock.now_unix_ns(), MAP, grid.cell, grid.origin, cells)
         return [Reply(message)]
 

@@ -50,6 +50,8 @@ class World:
         self.keyframes: list[Source] = []
         self.poses: list[np.ndarray] = []
         self.version = 0
+        #: Ids are never given twice.
+        self.given = 0
 
     def step(self) -> None:
         self.version += int(self.rng.integers(1, 3))
@@ -60,7 +62,7 @@ class World:
         elif kind == 3:
             self.poses = [self._moved(pose) for pose in self.poses]
         else:
-            number = max((source.id for source in self.keyframes), default=-1) + 1
+            number, self.given = self.given, self.given + 1
             count = int(self.rng.integers(0, self.points))
             cloud = self.rng.normal(0.0, 0.4, (count, 3))
             self.keyframes.append(Source(number, STAMP + number * 10**9, cloud))
@@ -177,9 +179,9 @@ def test_the_cloud_is_where_the_map_has_it() -> None:
         world.update(encoder)
     found, expected = encoder.state.cloud(), world.cloud()
     assert len(found) == len(expected) > 50
-    # Poses may lag by the tolerances: 2 mm and 1 mrad at under 2.5 m, and the rounding of both.
+    # Poses may lag by the tolerances: 2 mm and 1 mrad at under 2.5 m, and the rounding of both; points by 2.5 mm.
     distance = np.linalg.norm(found[:, None] - expected[None], axis=2).min(axis=1)
-    assert distance.max() < 0.009
+    assert distance.max() < 0.013
 
 
 def test_small_corrections_are_not_sent_but_never_add_up() -> None:
@@ -216,38 +218,24 @@ def test_a_restarted_sender_and_a_new_map_need_no_snapshot() -> None:
     assert_same(decoder.state, streams[-1].state)
 
 
-def test_a_snapshot_goes_in_one_payload_while_it_fits() -> None:
-    world, encoder = World(2, points=3000), MapStreamEncoder(MAP_ID)
-    for _ in range(12):
-        world.step()
-        world.update(encoder)
-    [whole] = encoder.snapshot_payloads()
-    pieces = encoder.snapshot_payloads(max_bytes=20_000)
-    assert len(pieces) > 1
-    assert max(len(piece) for piece in pieces) <= 20_000
-    for payloads in ([whole], pieces):
-        decoder = MapStreamDecoder()
-        assert [decoder.feed(payload) for payload in payloads] == [False] * (len(payloads) - 1) + [True]
-        assert_same(decoder.state, encoder.state)
-
-
 def test_the_bytes_lie_as_documented() -> None:
     """Read with nothing but docs/map-stream.md."""
     encoder = MapStreamEncoder(MAP_ID)
-    cloud = np.array([[0.002, -0.003, 0.004], [0.001, 0.005, 0.0]])
+    cloud = np.array([[0.010, -0.015, 0.020], [0.005, 0.025, -0.001], [1.005, 0.025, 0.0]])
     [message] = encoder.update(9, [Source(5, STAMP, cloud)], np.array([[1.5, -2.0, 0.25, 0, 0, 0.6, 0.8]]))
     magic, form, kind, size, map_id, _, base, version, part, parts, digest = struct.unpack_from(
         "<4sBBHQIIIHH8s", message
     )
-    assert (magic, form, kind, map_id, base, version, part, parts) == (b"RMAP", 1, 1, MAP_ID, 0, 9, 0, 1)
+    assert (magic, form, kind, map_id, base, version, part, parts) == (b"RMAP", 2, 1, MAP_ID, 0, 9, 0, 1)
     assert len(message) == 40 + size
     body = zlib.decompress(message[40:])
     pose = struct.pack("<3i4h", 1500, -2000, 250, 0, 0, round(0.6 * 32767), round(0.8 * 32767))
-    keyframe = struct.pack("<BIqI", 1, 5, STAMP, 2) + pose
-    points = struct.pack("<BIH6h", 2, 5, 2, 1, 1, 5, -3, 0, 4)
-    assert body == keyframe + points
-    rows = hashlib.blake2b(struct.pack("<6h", 1, 5, 0, 2, -3, 4), digest_size=16).digest()
-    state = struct.pack("<QII", MAP_ID, 9, 1) + struct.pack("<IqI", 5, STAMP, 2) + pose + rows
+    keyframe = struct.pack("<BIqI", 1, 5, STAMP, 3) + pose
+    # The strip of y = -3 comes before that of y = 5. Differences of x: 2, -1, 200; of y: -3, 8, 0; of z: 4, -4, 0.
+    steps = bytes([4, 1, 0x90, 0x03, 5, 16, 0, 8, 7, 0])
+    assert body == keyframe + struct.pack("<BIH", 2, 5, 3) + steps
+    rows = hashlib.blake2b(struct.pack("<9h", 2, -3, 4, 1, 5, 0, 201, 5, 0), digest_size=16).digest()
+    state = struct.pack("<QII", MAP_ID, 9, 1) + struct.pack("<IqI", 5, STAMP, 3) + pose + rows
     assert digest == hashlib.blake2b(state, digest_size=8).digest()
 
 
@@ -314,7 +302,7 @@ records = st.one_of(
 
 @given(st.lists(records, max_size=30))
 def test_records_come_back_as_they_were(content: list[object]) -> None:
-    found = [record for body in pack_bodies(content) for record in unpack_records(body)]
+    found = [record for body in pack_bodies(content) for record in unpack_records(zlib.decompress(body))]
     assert [type(record) for record in found] == [type(record) for record in content]
     for got, sent in zip(found, content, strict=True):
         for a, b in zip(got, sent, strict=True):
@@ -325,19 +313,20 @@ def test_a_large_keyframe_is_spread_over_messages_that_are_well_filled() -> None
     encoder, decoder = MapStreamEncoder(MAP_ID), MapStreamDecoder()
     cloud = np.random.default_rng(0).uniform(-0.5, 0.5, (20_000, 3))
     messages = encoder.update(1, [Source(7, STAMP, cloud)], np.array([[0, 0, 0, 0, 0, 0, 1.0]]))
-    assert len(messages) == -(-len(encoder.state.keyframes[7].points) * 6 // 3980)
     for message in messages:
         assert len(message) <= MAX_MESSAGE_BYTES
         decoder.feed(message)
+    # No piece of a keyframe is longer than 2.4 KB, and of such points 0.9 KB.
+    assert min(len(message) for message in messages[:-1]) > MAX_MESSAGE_BYTES - 900
     assert_same(decoder.state, encoder.state)
 
 
 def test_points_that_the_format_cannot_carry_are_left_out_and_counted() -> None:
     encoder = MapStreamEncoder(MAP_ID)
-    cloud = np.array([[0.001, 0.0, 0.0], [np.nan, 0, 0], [40.0, 0, 0], [0.0012, 0.0004, 0.0], [-32.767, 0, 0]])
+    cloud = np.array([[0.001, 0.0, 0.0], [np.nan, 0, 0], [40.0, 0, 0], [0.0012, 0.0004, 0.0], [-32.0, 0, 0]])
     encoder.update(1, [Source(0, STAMP, cloud)], np.array([[0, 0, 0, 0, 0, 0, -1.0]]), clock_offset_ns=5)
     keyframe = encoder.state.keyframes[0]
-    assert keyframe.points.tolist() == [[-32767, 0, 0], [1, 0, 0]]
+    assert keyframe.points.tolist() == [[-6400, 0, 0], [0, 0, 0]]
     assert keyframe.pose == (0, 0, 0, 0, 0, 0, 32767)
     assert keyframe.stamp_ns == STAMP + 5
     assert encoder.points_left_out == 2

@@ -235,6 +235,13 @@ class MapSection(Section):
     """The map as it is published."""
 
     point_voxel: float = parameter(0.01, "m", "points of a keyframe closer than this are one", low=0.001, high=0.5)
+    stream_cell: float = parameter(
+        0.03,
+        "m",
+        "the map stream tells one point of each cell of ground: 1 KB for a metre of gallery",
+        low=0.005,
+        high=0.5,
+    )
     grid_cell: float = parameter(0.05, "m", "cell of the published occupancy grid", low=0.005, high=1.0)
     obstacle_height: float = parameter(
         0.04, "m", "a step within a cell's neighbourhood that makes it an obstacle", low=0.005, high=1.0

@@ -8,24 +8,24 @@ from collections.abc import Iterable, Iterator
 from enum import IntEnum
 from typing import NamedTuple, TypeAlias
 
-import numpy as np
-
-from robominer_slam.publishing.map_state import DIGEST_BYTES, POSE, PointArray
+from robominer_slam.publishing.map_state import DIGEST_BYTES, POSE
+from robominer_slam.publishing.point_bytes import PointArray, PointBytesError, pack_points, unpack_points
 
 MAGIC = b"RMAP"
-FORMAT = 1
+FORMAT = 2
 MAX_MESSAGE_BYTES = 4096
-#: Before compression. A body that does not compress grows by 11 bytes at most, so every message fits.
-MAX_BODY_BYTES = 4000
-#: A points record is not begun for fewer than this many points while more are to follow.
-_MIN_CHUNK = 32
+#: Of a body before compression, whatever it shrinks to: a receiver never has to hold more.
+MAX_BODY_BYTES = 16_384
+#: Points in one record: few enough that a message is filled well.
+_CHUNK = 256
 
 _HEADER = struct.Struct(f"<4sBBHQIIIHH{DIGEST_BYTES}s")
 _KEYFRAME = struct.Struct("<BIqI")
 _POINTS = struct.Struct("<BIH")
 _POSE = struct.Struct("<BI")
 _REMOVE = struct.Struct("<BI")
-_POINT_BYTES = 6
+_MAX_PACKED_BYTES = MAX_MESSAGE_BYTES - _HEADER.size
+_LEVEL = 9
 
 
 class MapStreamError(ValueError):
@@ -102,34 +102,47 @@ Record: TypeAlias = KeyframeRecord | PointsRecord | PoseRecord | RemoveRecord
 
 
 def pack_bodies(records: Iterable[Record]) -> list[bytes]:
-    """Records in order, gathered into bodies of at most `MAX_BODY_BYTES`; at least one body."""
+    """Records in order, gathered into compressed bodies that each fit a message; at least one body."""
     bodies: list[bytes] = []
-    body = b""
+    filling = _Filling()
+    for piece in _pieces(records):
+        if not filling.take(piece):
+            bodies.append(filling.packed)
+            filling = _Filling()
+            # A piece alone always fits: it is at most 2.4 KB.
+            filling.take(piece)
+    return [*bodies, filling.packed]
+
+
+class _Filling:
+    """A body that is being filled: takes pieces as long as it fits a message."""
+
+    def __init__(self) -> None:
+        self._deflater = zlib.compressobj(_LEVEL)
+        self._out = b""
+        self._size = 0
+        self.packed = self._deflater.copy().flush()
+
+    def take(self, piece: bytes) -> bool:
+        """Append a piece; False if the message has no room for it."""
+        tried = self._deflater.copy()
+        out = self._out + tried.compress(piece)
+        packed = out + tried.copy().flush()
+        if len(packed) > _MAX_PACKED_BYTES or self._size + len(piece) > MAX_BODY_BYTES:
+            return False
+        self._deflater, self._out, self.packed = tried, out, packed
+        self._size += len(piece)
+        return True
+
+
+def _pieces(records: Iterable[Record]) -> Iterator[bytes]:
+    """Records packed; the points of a keyframe in several."""
     for record in records:
-        for size, packed in _pieces(record, MAX_BODY_BYTES - len(body)):
-            if len(body) + size > MAX_BODY_BYTES:
-                bodies.append(body)
-                body = b""
-            body += packed
-    return [*bodies, body]
-
-
-def _pieces(record: Record, room: int) -> Iterator[tuple[int, bytes]]:
-    """A record packed; the points of a keyframe in pieces that fill the messages."""
-    if not isinstance(record, PointsRecord):
-        packed = _pack(record)
-        yield len(packed), packed
-        return
-    points = record.points
-    while len(points):
-        fit = (room - _POINTS.size) // _POINT_BYTES
-        if fit < min(_MIN_CHUNK, len(points)):
-            fit = (MAX_BODY_BYTES - _POINTS.size) // _POINT_BYTES
-            room = MAX_BODY_BYTES
-        packed = _pack(PointsRecord(record.id, points[:fit]))
-        yield len(packed), packed
-        points = points[fit:]
-        room -= len(packed)
+        if not isinstance(record, PointsRecord):
+            yield _pack(record)
+            continue
+        for start in range(0, len(record.points), _CHUNK):
+            yield _pack(PointsRecord(record.id, record.points[start : start + _CHUNK]))
 
 
 def _pack(record: Record) -> bytes:
@@ -137,10 +150,7 @@ def _pack(record: Record) -> bytes:
         case KeyframeRecord(id=key, stamp_ns=stamp_ns, pose=pose, point_count=count):
             return _KEYFRAME.pack(_Tag.KEYFRAME, key, stamp_ns, count) + POSE.pack(*pose)
         case PointsRecord(id=key, points=points):
-            # Sorted by x, so that its differences are small and compress; they wrap modulo 2^16.
-            columns = points.T.astype("<i2")
-            columns[0, 1:] -= points[:-1, 0]
-            return _POINTS.pack(_Tag.POINTS, key, len(points)) + columns.tobytes()
+            return _POINTS.pack(_Tag.POINTS, key, len(points)) + pack_points(points)
         case PoseRecord(id=key, pose=pose):
             return _POSE.pack(_Tag.POSE, key) + POSE.pack(*pose)
         case RemoveRecord(id=key):
@@ -159,8 +169,8 @@ def unpack_records(body: bytes) -> list[Record]:
         while at < len(body):
             record, at = _unpack(body, at)
             records.append(record)
-    except struct.error as error:
-        raise MapStreamError(f"a record that is cut: {error}") from error
+    except (struct.error, PointBytesError) as error:
+        raise MapStreamError(f"a record that is cut or damaged: {error}") from error
     return records
 
 
@@ -173,12 +183,7 @@ def _unpack(body: bytes, at: int) -> tuple[Record, int]:
     if tag == _Tag.POINTS:
         _, key, count = _POINTS.unpack_from(body, at)
         at += _POINTS.size
-        end = at + count * _POINT_BYTES
-        if end > len(body):
-            raise MapStreamError(f"a record of {count} points that is cut")
-        columns = np.frombuffer(body, dtype="<i2", count=3 * count, offset=at).reshape(3, count)
-        points = columns.T.astype(np.int16)
-        points[:, 0] = np.cumsum(columns[0], dtype=np.int16)
+        points, end = unpack_points(body, at, count)
         return PointsRecord(key, points), end
     if tag == _Tag.POSE:
         _, key = _POSE.unpack_from(body, at)
@@ -197,9 +202,8 @@ def _unpack_pose(body: bytes, at: int) -> tuple[int, ...]:
     return pose
 
 
-def pack_message(header: Header, body: bytes) -> bytes:
-    """One message; the body is compressed here."""
-    packed = zlib.compress(body)
+def pack_message(header: Header, packed: bytes) -> bytes:
+    """One message of a body that is compressed already."""
     head = _HEADER.pack(MAGIC, FORMAT, header.kind, len(packed), *header[1:])
     return head + packed
 

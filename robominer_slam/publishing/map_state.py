@@ -13,11 +13,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robominer_slam import geometry
+from robominer_slam.publishing.point_bytes import PointArray, ordered
 
 FloatArray = NDArray[np.float64]
-PointArray = NDArray[np.int16]
 
 MILLIMETRES_PER_METRE = 1000.0
+#: Points are told to 5 mm: what a whisker knows of a touch is 1 to 2 mm, and each millimetre costs 0.3 bytes a point.
+POINT_UNIT_M = 0.005
+#: Of a point from its keyframe, along an axis: differences of two then still fit three bytes.
+FARTHEST_M = 32.0
 #: A quaternion's component of 1.
 QUATERNION_UNIT = 32767.0
 DIGEST_BYTES = 8
@@ -36,7 +40,7 @@ class StreamKeyframe:
     Attributes:
         stamp_ns: UNIX time.
         pose: T_map_base as x y z (mm), qx qy qz qw (1/32767), with qw >= 0.
-        points: shape (m, 3), mm, in base_link at the keyframe; every point once, sorted by x, y, z.
+        points: shape (m, 3), in units of 5 mm, in base_link at the keyframe; once each, in `point_bytes`' order.
         points_digest: of the points.
         packed: what of it goes into the state's digest, behind the id; follows from the others.
     """
@@ -60,7 +64,8 @@ class StreamKeyframe:
 
     def points_m(self) -> FloatArray:
         """Points in base_link at the keyframe, shape (m, 3), m."""
-        return self.points / MILLIMETRES_PER_METRE
+        metres: FloatArray = self.points.astype(np.float64) * POINT_UNIT_M
+        return metres
 
 
 @dataclass(slots=True)
@@ -114,10 +119,9 @@ def quantise_poses(poses: ArrayLike) -> NDArray[np.int32]:
 def quantise_points(points: ArrayLike) -> tuple[PointArray, int]:
     """Points (m, 3), m, in the stream's units, each once and sorted; and how many had to be left out.
 
-    Left out is what is not finite or farther than 32.767 m from the keyframe along an axis.
+    Left out is what is not finite or farther than 32 m from the keyframe along an axis.
     """
-    values = np.rint(np.asarray(points, dtype=np.float64).reshape(-1, 3) * MILLIMETRES_PER_METRE)
-    usable = (np.abs(values) <= np.iinfo(np.int16).max).all(axis=1)
+    values = np.rint(np.asarray(points, dtype=np.float64).reshape(-1, 3) / POINT_UNIT_M)
+    usable = (np.abs(values) <= FARTHEST_M / POINT_UNIT_M).all(axis=1)
     kept = values[usable].astype(np.int16)
-    unique = np.unique(kept, axis=0).reshape(-1, 3)
-    return unique, len(values) - len(kept)
+    return ordered(kept), len(values) - len(kept)

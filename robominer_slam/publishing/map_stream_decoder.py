@@ -26,7 +26,8 @@ from robominer_slam.publishing.map_records import (
     unpack_messages,
     unpack_records,
 )
-from robominer_slam.publishing.map_state import MapState, PointArray, StreamKeyframe
+from robominer_slam.publishing.map_state import MapState, StreamKeyframe
+from robominer_slam.publishing.point_bytes import PointArray
 
 #: Messages that wait for the rest of their update or for the update before: 64 MB at most. A whole map that
 #: comes as a snapshot has to fit too.
@@ -70,6 +71,14 @@ class MapStreamDecoder:
         self._stream: _Stream | None = None
         self._left: deque[_Stream] = deque(maxlen=_REMEMBERED_STREAMS)
         self._gathering: dict[Header, _Gathering] = {}
+
+    @property
+    def copy(self) -> dict[str, int]:
+        """Parameters for a query of `map/snapshot` that asks only for what this copy lacks; none before the first."""
+        if self.state is None or self._stream is None:
+            return {}
+        map_id, epoch = self._stream
+        return {"map_id": map_id, "epoch": epoch, "since": self.state.version}
 
     def feed(self, data: bytes) -> bool:
         """Take one or more messages; True if the state changed."""

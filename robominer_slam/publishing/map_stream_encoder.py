@@ -6,14 +6,16 @@ The format is in docs/map-stream.md.
 from __future__ import annotations
 
 import secrets
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robominer_slam import geometry
 from robominer_slam.publishing import map_state
+from robominer_slam.publishing.map_changes import MapChanges
 from robominer_slam.publishing.map_records import (
     Header,
     KeyframeRecord,
@@ -25,15 +27,16 @@ from robominer_slam.publishing.map_records import (
     pack_bodies,
     pack_message,
 )
-from robominer_slam.publishing.map_state import MapState
+from robominer_slam.publishing.map_state import MapState, StreamKeyframe
+from robominer_slam.publishing.new_ground import new_ground
 
 FloatArray = NDArray[np.float64]
 
 #: Poses that moved less than this against what was sent last are not sent again, m and rad.
 POSITION_TOLERANCE = 0.002
 ANGLE_TOLERANCE = 0.001
-#: Of an answer to a query: well below what receivers refuse (1 MiB).
-MAX_PAYLOAD_BYTES = 512 * 1024
+#: Farther apart than this along an axis, keyframes of any of our arrays have no ground in common, mm.
+REACH = 2000
 
 
 class SourceKeyframe(Protocol):
@@ -60,14 +63,17 @@ class MapStreamEncoder:
         points_left_out: points that the format cannot carry (not finite, or over 32 m from their keyframe).
     """
 
-    def __init__(self, map_id: int) -> None:
+    def __init__(self, map_id: int, cell: float | None = None) -> None:
         """Start with the empty map at version 0.
 
         Args:
             map_id: of the map, 64 bits.
+            cell: one point is told of each cell of ground of this size, m; None: every point.
         """
         self.state = MapState(map_id)
         self.points_left_out = 0
+        self._cell = cell
+        self._changes = MapChanges()
         self._sources: dict[int, NDArray[np.floating]] = {}
         self._sent_ids: list[int] = []
         self._sent_poses = np.zeros((0, 7), dtype=np.int32)
@@ -104,17 +110,42 @@ class MapStreamEncoder:
         moved = np.ones(len(ids), dtype=np.bool_)
         moved[:common] = _moved(self._sent_poses[:common], quantised[:common])
         sent[:common][~moved[:common]] = self._sent_poses[:common][~moved[:common]]
+        told = np.zeros(len(ids), dtype=np.bool_)
+        told[:common] = True
         for place, (source, changed) in enumerate(zip(keyframes, moved.tolist(), strict=True)):
             if changed or self._sources.get(source.id) is not source.points:
-                records += self._take(source, tuple(quantised[place].tolist()), clock_offset_ns)
+                near = told & (np.abs(quantised[:, :3] - quantised[place, :3]) < REACH).all(axis=1)
+                near[place], told[place] = False, True
+                neighbours = [ids[k] for k in np.flatnonzero(near).tolist()] if self._cell is not None else []
+                pose = tuple(quantised[place].tolist())
+                records += self._take(version, source, pose, clock_offset_ns, neighbours)
                 sent[place] = self.state.keyframes[source.id].pose
         for gone in sorted(self.state.keyframes.keys() - set(ids)):
             del self.state.keyframes[gone]
             del self._sources[gone]
+            self._changes.removed(gone, version)
             records.append(RemoveRecord(gone))
         self._sent_ids, self._sent_poses = ids, sent
         self.state.version = version
         return self._messages(Kind.UPDATE, base, records)
+
+    def changes(self, map_id: int, epoch: int, version: int) -> list[bytes] | None:
+        """The messages that bring a receiver from a version to the present one; None if it needs the whole.
+
+        Args:
+            map_id, epoch: of the receiver's copy.
+            version: of it.
+        """
+        if (map_id, epoch) != (self.state.map_id, self._epoch) or version > self.state.version:
+            return None
+        missed = self._changes.since(version)
+        if missed is None:
+            return None
+        keyframes = self.state.keyframes
+        records: list[Record] = [record for key in missed.whole for record in _new_keyframe(key, keyframes[key])]
+        records += [PoseRecord(key, keyframes[key].pose) for key in missed.poses]
+        records += [RemoveRecord(key) for key in missed.gone]
+        return self._messages(Kind.UPDATE, version, records)
 
     def snapshot(self) -> list[bytes]:
         """The messages that carry the whole state."""
@@ -123,28 +154,32 @@ class MapStreamEncoder:
             records += _new_keyframe(key, self.state.keyframes[key])
         return self._messages(Kind.SNAPSHOT, 0, records)
 
-    def snapshot_payloads(self, max_bytes: int = MAX_PAYLOAD_BYTES) -> list[bytes]:
-        """The snapshot's messages, concatenated: one payload but for large maps."""
-        payloads = [b""]
-        for message in self.snapshot():
-            if len(payloads[-1]) + len(message) > max_bytes:
-                payloads.append(b"")
-            payloads[-1] += message
-        return payloads
-
-    def _take(self, source: SourceKeyframe, pose: tuple[int, ...], clock_offset_ns: int) -> Iterable[Record]:
+    def _take(
+        self, version: int, source: SourceKeyframe, pose: tuple[int, ...], offset_ns: int, neighbours: list[int]
+    ) -> list[Record]:
         known = self.state.keyframes.get(source.id)
         if known is None or self._sources[source.id] is not source.points:
             self._sources[source.id] = source.points
             points, left_out = map_state.quantise_points(source.points)
             self.points_left_out += left_out
-            new = map_state.keyframe(source.stamp_ns + clock_offset_ns, pose, points)
+            new = map_state.keyframe(source.stamp_ns + offset_ns, pose, points)
+            if self._cell is not None:
+                new = self._thinned(new, self._cell, neighbours)
             self.state.keyframes[source.id] = new
-            return _new_keyframe(source.id, new)
+            self._changes.whole(source.id, version)
+            return list(_new_keyframe(source.id, new))
         if not _moved(np.array([known.pose]), np.array([pose]))[0]:
-            return ()
+            return []
         self.state.keyframes[source.id] = replace(known, pose=pose)
-        return (PoseRecord(source.id, pose),)
+        self._changes.moved(source.id, version)
+        return [PoseRecord(source.id, pose)]
+
+    def _thinned(self, keyframe: StreamKeyframe, cell: float, neighbours: list[int]) -> StreamKeyframe:
+        """The keyframe with the points whose ground its neighbours have not told."""
+        T = geometry.from_vector7(keyframe.vector7())
+        near = [self.state.keyframes[key] for key in neighbours]
+        points = new_ground(keyframe.points, keyframe.points_m(), T, near, cell)
+        return map_state.keyframe(keyframe.stamp_ns, keyframe.pose, points)
 
     def _messages(self, kind: Kind, base_version: int, records: list[Record]) -> list[bytes]:
         bodies = pack_bodies(records)
@@ -159,7 +194,7 @@ class MapStreamEncoder:
         ]
 
 
-def _new_keyframe(key: int, keyframe: map_state.StreamKeyframe) -> Iterator[Record]:
+def _new_keyframe(key: int, keyframe: StreamKeyframe) -> Iterator[Record]:
     yield KeyframeRecord(key, keyframe.stamp_ns, keyframe.pose, len(keyframe.points))
     if len(keyframe.points):
         yield PointsRecord(key, keyframe.points)
