@@ -84,6 +84,23 @@ def load_map(path: Path, wanted: str = "", clock_offset_ns: int = 0) -> tuple[in
     return map_id, SavedMap(keyframes, poses, edges, name or str(map_id))
 
 
+def map_names(path: Path) -> list[tuple[int, int]]:
+    """Id and time of creation (UNIX, ns) of every map with keyframes, oldest first. Raises as `load_map`."""
+    if not path.exists():
+        raise StoreError(f"{path}: is not there; expected a database with saved maps")
+    connection = open_database(path)
+    try:
+        rows = connection.execute(
+            "SELECT id, created_unix_ns FROM maps WHERE EXISTS (SELECT 1 FROM keyframes WHERE map_id = maps.id) "
+            "ORDER BY id"
+        ).fetchall()
+    except sqlite3.Error as error:
+        raise StoreError(f"{path}: cannot be read: {error}") from error
+    finally:
+        connection.close()
+    return [(int(number), int(created)) for number, created in rows]
+
+
 def map_to_start_in(
     slam: SlamSection, path: Path, clock_offset_ns: int = 0
 ) -> tuple[int, SavedMap] | tuple[None, None]:

@@ -47,6 +47,7 @@ COMMANDS = {
     "evaluate": "robominer_slam.cli.evaluate:evaluate",
     "graph": "robominer_slam.cli.graph:graph",
     "keys": "robominer_slam.cli.keys:keys",
+    "map": "robominer_slam.cli.map:map_group",
     "replay": "robominer_slam.cli.replay:replay",
     "run": "robominer_slam.cli.run:run",
     "status": "robominer_slam.cli.status:status",
