@@ -29,6 +29,7 @@ class KeyframeMotion:
             odometry, or the vertical gyro's (rad/s).
         bias_posterior: their present estimate, shape (nb,).
         bias_covariance: of the present estimate, shape (nb, nb).
+        bias_walk: covariance of what the biases have changed by since the last keyframe, shape (nb, nb); None: nothing.
     """
 
     stamp_ns: int
@@ -38,3 +39,4 @@ class KeyframeMotion:
     bias: FloatArray
     bias_posterior: FloatArray
     bias_covariance: FloatArray
+    bias_walk: FloatArray | None = None

@@ -87,6 +87,7 @@ class RobustOdometry:
         #: What a disagreement with the gyro makes of the screws' variance.
         self._distrust = 1.0
         self._stamp_ns: int | None = None
+        self._marked_ns: int | None = None
         self._angles = ScrewAngleSpeeds()
         self._odometry_ns: int | None = None
         self._screws_ns: int | None = None
@@ -162,7 +163,20 @@ class RobustOdometry:
         self._predict(stamp_ns)
         x, P, b = self._filter.x, self._filter.P, self._bias
         T, covariance, jacobian = self._space.motion(x[REL], *given_bias(x, P, b))
-        motion = KeyframeMotion(stamp_ns, T, covariance, jacobian, x[b].copy(), x[b].copy(), P[b, b].copy())
+        marked, self._marked_ns = self._marked_ns, stamp_ns
+        since = 0.0 if marked is None else (stamp_ns - marked) * 1e-9
+        settings = self._settings
+        walk = settings.gyro_bias_walk if self._source == "fused" else settings.odometry_bias_walk
+        motion = KeyframeMotion(
+            stamp_ns,
+            T,
+            covariance,
+            jacobian,
+            x[b].copy(),
+            x[b].copy(),
+            P[b, b].copy(),
+            walk**2 * since * np.eye(b.stop - b.start),
+        )
         self._filter.keyframe()
         self._state = None
         return motion

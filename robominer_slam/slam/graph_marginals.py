@@ -122,8 +122,14 @@ class TrackedCovariance:
         if self._base is not None and float(np.linalg.eigvalsh(self._P[:2, :2])[-1]) > sigma**2:
             self.forget()
 
-    def follow(self, edge: LevelEdge, bias: FloatArray) -> None:
-        """A keyframe was appended by an odometry edge; `bias` is the graph's, shape (nb,)."""
+    def follow(self, edge: LevelEdge, bias: FloatArray, walk: FloatArray | None = None) -> None:
+        """A keyframe was appended by an odometry edge.
+
+        Args:
+            edge: its edge.
+            bias: the graph's, shape (nb,).
+            walk: covariance of what the biases have changed by on the way, shape (nb, nb); None: nothing.
+        """
         if self._base is None:
             return
         self._tail += 1
@@ -133,6 +139,8 @@ class TrackedCovariance:
         F = np.eye(3 + nb)
         F[:3, :3] = geometry.se2_adjoint(geometry.se2_inverse(step))
         F[:3, 3:] = edge.jacobian
+        if walk is not None:
+            self._P[3:, 3:] += walk
         self._P = F @ self._P @ F.T
         self._P[:3, :3] += np.linalg.inv(edge.information)
         self._way = F @ self._way

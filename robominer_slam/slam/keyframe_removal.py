@@ -46,7 +46,13 @@ def composed(first: LevelEdge, second: LevelEdge, bias: FloatArray) -> LevelEdge
         1.0 / (1.0 / first.dz_information + 1.0 / second.dz_information),
         Ad @ first.jacobian + second.jacobian,
         bias.copy(),
+        fade=min(first.fade, second.fade),
+        slack=Ad @ _slack(first) @ Ad.T + _slack(second),
     )
+
+
+def _slack(edge: LevelEdge) -> FloatArray:
+    return np.zeros((3, 3)) if edge.slack is None else edge.slack
 
 
 def remove_keyframes(graph: KeyframeGraph, keys: list[int]) -> list[LevelEdge]:

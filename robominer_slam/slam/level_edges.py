@@ -28,6 +28,8 @@ class LevelEdge:
         jacobian: what the slow biases do to Z, shape (3, nb).
         reference: the biases that Z was made with, shape (nb,).
         enabled: False where a closure was taken back.
+        fade: how much of a change of the biases of now still concerns this edge, 1 for all of it (`bias_walk`).
+        slack: covariance that the edge gets when it has faded, shape (3, 3); None: none.
     """
 
     kind: Literal["odometry", "loop"]
@@ -40,6 +42,8 @@ class LevelEdge:
     jacobian: FloatArray
     reference: FloatArray
     enabled: bool = True
+    fade: float = 1.0
+    slack: FloatArray | None = None
 
 
 class LevelEdges:
@@ -75,6 +79,8 @@ class LevelEdges:
                 "jacobian": GrowingArray((3, nb), np.float64),
                 "reference": GrowingArray((nb,), np.float64),
                 "enabled": GrowingArray((), np.bool_),
+                "fade": GrowingArray((), np.float64),
+                "slack": GrowingArray((3, 3), np.float64),
                 "chi2": GrowingArray((), np.float64),
             }
         values: dict[str, object] = {
@@ -90,6 +96,8 @@ class LevelEdges:
             "jacobian": edge.jacobian,
             "reference": edge.reference,
             "enabled": edge.enabled,
+            "fade": edge.fade,
+            "slack": np.zeros((3, 3)) if edge.slack is None else edge.slack,
             "chi2": 0.0,
         }
         for name, column in self._columns.items():
@@ -137,6 +145,8 @@ class LevelEdges:
             self.jacobian[row].copy(),
             self.reference[row].copy(),
             bool(self.enabled[row]),
+            float(self.fade[row]),
+            self.slack[row].copy(),
         )
 
     def _view(self, name: str) -> NDArray[Any]:
@@ -163,6 +173,16 @@ class LevelEdges:
     def loop(self) -> NDArray[np.bool_]:
         """Which are loop closures, shape (m,)."""
         return self._view("loop")
+
+    @property
+    def fade(self) -> FloatArray:
+        """What is left of a change of the biases, shape (m,)."""
+        return self._view("fade")
+
+    @property
+    def slack(self) -> FloatArray:
+        """Covariances that edges get when they have faded, shape (m, 3, 3)."""
+        return self._view("slack")
 
     @property
     def Z(self) -> FloatArray:

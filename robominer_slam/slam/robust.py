@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from robominer_slam import geometry
 from robominer_slam.configuration.robust_slam_section import RobustSlamSection
+from robominer_slam.slam.bias_walk import BiasWalk, faded_noise
 from robominer_slam.slam.bounded_map import BoundedMap
 from robominer_slam.slam.closure_agreement import agreeing
 from robominer_slam.slam.closure_counters import ClosureCounters
@@ -68,6 +69,8 @@ class RobustBackend:
         self._patches = PatchMemory(bounds.max_points_in_memory, pages)
         self._map = BoundedMap(bounds, self._graph, self._patches)
         self._tracked = TrackedCovariance(self._graph, bounds.refresh)
+        self._walk = BiasWalk()
+        self._bias_covariance = np.zeros((0, 0))
         self._published = PublishedEdges()
         self._since_full = 0
         self._searched = self._closed = -1
@@ -117,6 +120,9 @@ class RobustBackend:
             J = motion.bias_jacobian[PLANAR]
             covariance = covariance + J @ motion.bias_covariance @ J.T
         information = _inverse(covariance + np.diag(EDGE_FLOOR))
+        walk = None if motion.bias_walk is None else motion.bias_walk[:nb, :nb]
+        self._walk.step(graph.edges, graph.bias, self._bias_covariance, walk)
+        self._bias_covariance = motion.bias_covariance[:nb, :nb]
         edge = LevelEdge(
             "odometry",
             self._last.id,
@@ -127,6 +133,9 @@ class RobustBackend:
             1.0 / HEIGHT_WALK**2,
             motion.bias_jacobian[PLANAR][:, :nb],
             motion.bias[:nb],
+            slack=None
+            if walk is None or not nb
+            else faded_noise(motion.bias_jacobian[PLANAR][:, :nb], self._bias_covariance, walk),
         )
         graph.edges.append(edge)
         if len(graph.nodes) <= self._parameters.bounds.local_window:
@@ -139,7 +148,7 @@ class RobustBackend:
         step = geometry.se2_exp(edge.jacobian @ (graph.bias - edge.reference))
         pose = geometry.se2_compose(graph.nodes[self._last.id], geometry.se2_compose(Z, step))
         graph.nodes.append(k, pose, graph.nodes.height(self._last.id) + dz, tilt, keyframe.travelled)
-        self._tracked.follow(edge, graph.bias)
+        self._tracked.follow(edge, graph.bias, walk)
 
     def _source(self, keyframe: Keyframe) -> tuple[FloatArray, int]:
         """Touches of the last keyframes, in the level frame of the newest, and the id of the oldest."""
