@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robominer_slam import geometry
+from robominer_slam.configuration.model import MapSection
 from robominer_slam.configuration.robust_slam_section import RobustSlamSection
 from robominer_slam.estimation.keyframe_motion import KeyframeMotion
 from robominer_slam.mapping.keyframe_map import KeyframeMap
@@ -171,7 +172,7 @@ HEAD = (
 def run(area: str, seed: int, count: int, block: int, parameters: RobustSlamSection) -> Iterator[Block]:
     """Drive, and say what each block of keyframes took."""
     backend = RobustBackend(parameters, SqlitePages())
-    keyframes, stream = KeyframeMap(parameters.point_voxel), MapStreamEncoder(1)
+    keyframes, stream = KeyframeMap(parameters.point_voxel), MapStreamEncoder(1, MapSection().stream_cell)
     current = Block(0)
     for keyframe, true in drive(area, seed, count):
         start = process_time()
