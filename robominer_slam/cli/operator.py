@@ -35,7 +35,9 @@ Example of a recording: robominer-slam operator --recording drive.mcap"""
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
     help="With --recording: configuration; the recording's own by default.",
 )
-@click.option("--open/--no-open", "browse", default=None, help="Open a browser here.  [default: where there is a display]")
+@click.option(
+    "--open/--no-open", "browse", default=None, help="Open a browser here.  [default: where there is a display]"
+)
 def operator(
     connect: str,
     robot: str,

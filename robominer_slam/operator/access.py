@@ -70,7 +70,8 @@ def _cookie(headers: Headers) -> str:
 
 
 def _asked(scope: Scope) -> str:
-    return parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+    query: str = scope["query_string"].decode("latin-1")
+    return parse_qs(query).get("token", [""])[0]
 
 
 async def _refuse(scope: Scope, receive: Receive, send: Send, code: int, reason: str) -> None:

@@ -43,9 +43,9 @@ class CommandPanel:
     def map_commands(self) -> None:
         """Save the map, begin another, say where the robot is."""
         with ui.element("div").classes("buttons"):
-            ui.button("Save map …", on_click=self._save_map).props("no-caps unelevated")
+            ui.button("Save map …", on_click=self._save_map, color=None).props("no-caps unelevated")
             self._button("New map", "new_map", "The robot begins an empty map here. The present one stays stored.")
-            ui.button("Localise …", on_click=lambda: self._localize({})).props("no-caps unelevated")
+            ui.button("Localise …", on_click=lambda: self._localize({}), color=None).props("no-caps unelevated")
         self._result()
 
     def place(self, place: Mapping[str, Any]) -> None:
@@ -59,7 +59,7 @@ class CommandPanel:
         def ask() -> None:
             self._confirm(text, consequence, lambda: lambda: (name, {}))
 
-        return ui.button(text, on_click=ask).props(f"no-caps unelevated data-testid=cmd-{name}")
+        return ui.button(text, on_click=ask, color=None).props(f"no-caps unelevated data-testid=cmd-{name}")
 
     def _result(self) -> None:
         self._results.append(ui.label("").classes("command-result").props('role=status data-testid="command-result"'))
@@ -118,13 +118,14 @@ class CommandPanel:
                     dialog.close()
                     await self._send(title, name, parameters)
 
-                ui.button(title, on_click=go).props("no-caps unelevated data-testid=confirm")
+                ui.button(title, on_click=go, color=None).props("no-caps unelevated data-testid=confirm")
         dialog.open()
 
     async def _send(self, title: str, name: str, parameters: dict[str, str]) -> None:
         self._tell("", f"{title}: asked, waiting for the robot …")
         result = await run.io_bound(self._session.command, name, parameters)
-        self._tell(result.outcome.value, f"{title}: {WORDS[result.outcome]}. {result.message}")
+        if result is not None:  # None: the console ends
+            self._tell(result.outcome.value, f"{title}: {WORDS[result.outcome]}. {result.message}")
 
     def _tell(self, outcome: str, text: str) -> None:
         for label in self._results:

@@ -63,7 +63,7 @@ def _set_dark(map_view: MapView, *, dark: bool) -> None:
 
 
 def _header(session: Session, dark: ui.dark_mode) -> None:
-    ui.html(f'<h1>{session.robot}</h1>', sanitize=False)
+    ui.html(f"<h1>{session.robot}</h1>", sanitize=False)
     for name, title in (("state", "Localisation"), ("link", "Link"), ("fault_count", "Faults")):
         with ui.element("div").classes(f"pill pill-{name}").props(f'title="{title}" role=status data-testid={name}'):
             ui.element("i")
@@ -116,7 +116,8 @@ def _side(session: Session) -> CommandPanel:
                 ui.element("ul").props("id=faults data-testid=faults").classes("list follows-link")
             with _card("Link"):
                 _figures(
-                    (("last heard", "heard"), ("latency, robot to here", "latency"), ("latency, to this page", "latency_page"),
+                    (("last heard", "heard"), ("latency, robot to here", "latency"),
+                     ("latency, to this page", "latency_page"),
                      ("poses", "rate_pose"), ("telemetry", "rate_telemetry"), ("whisker frames", "rate_whiskers"),
                      ("this page", "rate_page"), ("bandwidth", "bandwidth"), ("of it the map", "bandwidth_map"),
                      ("received", "received"), ("outages", "outages"))

@@ -140,9 +140,7 @@ class PageStream:
             if model.closures_revision > self._closures_revision:
                 self._closures_revision, closures = model.closures_revision, model.closures.ravel().tolist()
             count, points = model.count, model.points
-        await self._json(
-            "map", reset=reset, slots=count, points=points, bounds=bounds, heights=self._steady(heights)
-        )
+        await self._json("map", reset=reset, slots=count, points=points, bounds=bounds, heights=self._steady(heights))
         if last > first:
             await self._socket.send_bytes(_HEAD.pack(POSES, first, last - first) + poses)
         if closures is not None:

@@ -59,7 +59,12 @@ class WhiskerHistory:
 
 
 def _options() -> dict[str, object]:
-    axis = {"nameLocation": "middle", "nameGap": 34, "axisLabel": {"color": "#8a98a6"}, "nameTextStyle": {"color": "#8a98a6"}}
+    axis = {
+        "nameLocation": "middle",
+        "nameGap": 34,
+        "axisLabel": {"color": "#8a98a6"},
+        "nameTextStyle": {"color": "#8a98a6"},
+    }
     line = {"type": "line", "showSymbol": False, "connectNulls": False, "data": []}
     return {
         "animation": False,
@@ -69,7 +74,15 @@ def _options() -> dict[str, object]:
         "xAxis": {"type": "value", "min": -SECONDS, "max": 0, "name": "time (s)", **axis, "nameGap": 26},
         "yAxis": [
             {"type": "value", "min": 0, "max": 90, "name": "inclination (°)", **axis},
-            {"type": "value", "min": -180, "max": 180, "interval": 90, "name": "azimuth (°)", **axis, "splitLine": {"show": False}},
+            {
+                "type": "value",
+                "min": -180,
+                "max": 180,
+                "interval": 90,
+                "name": "azimuth (°)",
+                **axis,
+                "splitLine": {"show": False},
+            },
         ],
         "series": [
             {**line, "name": "inclination", "color": _INCLINATION, "step": "end"},

@@ -6,7 +6,8 @@ import { sceneColours } from "robominer-console/colours.js";
 /** Between being asked for a drawing and drawing: above the first the graphics are overloaded, below the second not. */
 const LATE_MS = 60;
 const EARLY_MS = 25;
-const LEAST_DETAIL = 0.05;
+/** So many points are always drawn. */
+const LEAST_POINTS = 60000;
 const LAYERS = { points: "Points", path: "Path", keyframes: "Keyframes", closures: "Loop closures", trail: "Way driven", robot: "Robot" };
 
 export default {
@@ -47,7 +48,7 @@ export default {
           <div class="legend-ticks"><span v-for="tick in ticks">{{ tick }}</span></div>
         </div>
       </div>
-      <div class="map-compass" title="Axes of the map frame; its north is +y"><svg viewBox="-24 -24 48 48" ref="compass"><circle r="22"/><path d="M0,-19 L6,6 L0,2 L-6,6 Z"/><text y="20">N</text></svg><span>map +y</span></div>
+      <div class="map-compass" title="Axes of the map frame; its north is +y"><svg viewBox="-24 -24 48 48" ref="compass"><circle r="22"/><path d="M0,-17 L7,12 L0,7 L-7,12 Z"/></svg><span>N (map +y)</span></div>
       <div class="map-corner"><div ref="scale" class="map-scale"></div><span class="map-count">{{ count }}</span></div>
       <div class="map-empty" v-show="empty">No map yet: it grows where whiskers touch</div>
     </div>`,
@@ -170,7 +171,7 @@ export default {
     adapt(waited) {
       const own = this.own;
       const before = own.detail;
-      if (waited > LATE_MS) own.detail = Math.max(LEAST_DETAIL, 0.7 * before);
+      if (waited > LATE_MS) own.detail = Math.max(Math.min(1, LEAST_POINTS / (own.points || 1)), 0.7 * before);
       else if (waited < EARLY_MS) own.detail = Math.min(1, 1.08 * before);
       stream.stats.detail = own.detail;
       if (own.detail === before) return;

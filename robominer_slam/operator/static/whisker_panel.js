@@ -82,7 +82,7 @@ export default {
       const R = this.array.rotation[k];
       // Where the tip goes, in base_link: forward is up on the panel, left is left.
       const [forward, left] = [0, 1].map((i) => R[3 * i] * Math.cos(angle) + R[3 * i + 1] * Math.sin(angle));
-      const reach = 1.9 * this.radius * Math.min(1, inclination / FULL_BEND);
+      const reach = 1.5 * this.radius * Math.min(1, inclination / FULL_BEND);
       const level = Math.hypot(forward, left) || 1;
       mark.line.setAttribute("x2", ((-left / level) * reach).toFixed(1));
       mark.line.setAttribute("y2", ((-forward / level) * reach).toFixed(1));
