@@ -1,0 +1,149 @@
+"""The console on links of other kinds: a remote one, one that may only look on, a recording, a simulated robot."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, expect
+
+from tests.operator_page import PATIENCE_MS, browser, console, free_port, opened, program
+from tests.published_robot import PublishedRobot
+
+RECORDING = Path(__file__).parent / "recordings"
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Browser]:
+    with browser() as started:
+        yield started
+
+
+def test_telemetry_alone_is_enough_and_a_viewer_may_not_command(chromium: Browser, tmp_path: Path):
+    robot = PublishedRobot(f"tcp/127.0.0.1:{free_port()}", remote=True)
+    robot.obeys = False
+    with robot, console(tmp_path / "log", "--connect", robot.endpoint) as address:
+        page = opened(chromium, address)
+        expect(page.locator("body")).to_have_attribute("data-link", "live", timeout=PATIENCE_MS)
+        expect(page.locator("[data-whisker='17']")).to_have_attribute("data-state", "touch")
+        page.wait_for_function("parseInt(document.querySelector('.map-count').textContent) > 0")
+        expect(page.get_by_test_id("waypoint")).to_be_hidden()
+        page.get_by_test_id("cmd-rezero").click()
+        page.get_by_test_id("ask").get_by_test_id("confirm").click()
+        result = page.get_by_test_id("command-result").first
+        expect(result).to_have_attribute("data-outcome", "unanswered")
+        expect(result).to_contain_text("not answered")
+        expect(result).to_contain_text("may look on but not command")
+        assert page.complaints == []  # type: ignore[attr-defined]
+        page.close()
+
+
+def status_of(address: str, **headers: str) -> int:
+    try:
+        with urllib.request.urlopen(urllib.request.Request(address, headers=headers), timeout=5.0) as answer:
+            return int(answer.status)
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def test_others_need_the_token_and_other_sites_get_nothing(chromium: Browser, tmp_path: Path):
+    with PublishedRobot(f"tcp/127.0.0.1:{free_port()}") as robot:
+        options = ("--connect", robot.endpoint, "--host", "0.0.0.0", "--token", "secret")
+        with console(tmp_path / "log", *options) as address:
+            local = address.replace("0.0.0.0", "127.0.0.1")
+            bare = local.partition("?")[0]
+            assert status_of(bare) == status_of(bare + "export/map.ply") == 401
+            assert status_of(bare + "?token=wrong") == 401
+            page = opened(chromium, local)
+            expect(page.locator("body")).to_have_attribute("data-link", "live", timeout=PATIENCE_MS)
+            assert "secret" not in page.url
+            page.close()
+        with console(tmp_path / "log", "--connect", robot.endpoint) as address:
+            assert status_of(address) == 200
+            assert status_of(address, Origin="http://elsewhere.example") == 403
+            assert status_of(address, Host="elsewhere.example") == 403
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--connect", "tcp/127.0.0.1:1", "--port", "0", "--timeout", "0.3"], "is the robot's program running?"),
+        (["--host", "0.0.0.0"], "give --token"),
+        (["--recording", "no-such.mcap"], "no-such.mcap"),
+    ],
+)
+def test_mistakes_are_one_line_and_exit_code_2(arguments: list[str], expected: str):
+    done = subprocess.run(program("operator", *arguments), capture_output=True, text=True, timeout=30.0, check=False)
+    assert done.returncode == 2, done.stderr
+    assert expected in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_port_in_use_is_said(tmp_path: Path):
+    with (
+        PublishedRobot(f"tcp/127.0.0.1:{free_port()}") as robot,
+        console(tmp_path / "log", "--connect", robot.endpoint) as a,
+    ):
+        port = a.rsplit(":", 1)[1].strip("/")
+        command = program("operator", "--connect", robot.endpoint, "--port", port)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=30.0, check=False)
+    assert done.returncode == 2
+    assert f"--port {port}" in done.stderr
+    assert "give another --port" in done.stderr
+
+
+def test_a_recording_opens_in_the_same_console(chromium: Browser, tmp_path: Path):
+    short = tmp_path / "short.mcap"
+    drive = ["--scenario", "1", "--engine", "quasi-static", "--max-time", "14", "--out", str(tmp_path / "sim")]
+    subprocess.run(program("simulate", *drive, "--record", str(short)), check=True, capture_output=True, timeout=100.0)
+    with console(tmp_path / "log", "--recording", str(short)) as address:
+        page = opened(chromium, address)
+        expect(page.locator("[data-field='link']").first).to_have_text("recording", timeout=60_000)
+        expect(page.locator("body")).to_have_attribute("data-link", "recording")
+        page.wait_for_function("parseInt(document.querySelector('.map-count').textContent) > 0")
+        assert abs(float(page.get_by_test_id("time-line").locator("input").get_attribute("max")) - 14_000) < 1500
+        page.get_by_test_id("cmd-rezero").click()
+        page.get_by_test_id("ask").get_by_test_id("confirm").click()
+        expect(page.get_by_test_id("command-result").first).to_contain_text("refused. this is a recording")
+        with urllib.request.urlopen(f"{address}export/map.ply") as answer:
+            assert answer.read(3) == b"ply"
+        with urllib.request.urlopen(f"{address}export/poses.tum") as answer:
+            assert len(answer.read().splitlines()) > 100
+        page.close()
+
+
+def test_a_simulated_robot_takes_waypoints_over_zenoh(tmp_path: Path):
+    from robominer_slam.publishing.bus_messages import QueryError
+    from robominer_slam.publishing.zenoh_session import ZenohBus, ZenohSettings
+
+    endpoint, out = f"tcp/127.0.0.1:{free_port()}", tmp_path / "sim"
+    simulate = program(
+        "simulate", "--scenario", "0", "--engine", "quasi-static", "--out", str(out), "--listen", endpoint,
+        "--zenoh-waypoints", "--wait", "0", "--json",
+    )  # fmt: skip
+    with ZenohBus(ZenohSettings(listen=(endpoint,)), "robominer/rm3") as bus:
+        process = subprocess.Popen(simulate, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            answer = None
+            for _ in range(100):
+                try:
+                    answer = bus.get("sim/waypoint", timeout_s=0.5)
+                    break
+                except QueryError:
+                    assert process.poll() is None
+            assert answer is not None
+            far = {"x": "900", "y": "0", "yaw": "0", "id": "a"}
+            near = {"x": "0.5", "y": "0.1", "yaw": "1.5", "id": "b"}
+            refused, taken, again = (json.loads(bus.get("sim/waypoint", p)[0].payload) for p in (far, near, near))
+        finally:
+            process.terminate()
+            process.wait(20.0)
+    assert not refused["ok"]
+    assert "outside the ground" in refused["message"]
+    assert taken["ok"]
+    assert again == taken
