@@ -145,11 +145,12 @@ class PublishedRobot:
         return np.array([RADIUS_M * math.sin(angle), RADIUS_M * (1.0 - math.cos(angle)), angle])
 
     def _drive(self) -> None:
-        begin, sent_keyframes = time.monotonic(), -1
+        next_frame, sent_keyframes = time.monotonic(), -1
         next_telemetry = next_status = next_pose = 0.0
-        while not self._stop.wait(max(0.0, begin + self.frames / self._rate_hz - time.monotonic())):
+        while not self._stop.wait(max(0.0, next_frame - time.monotonic())):
             now = time.monotonic()
-            begin = now - self.frames / self._rate_hz if now - begin > self.frames / self._rate_hz + 0.2 else begin
+            # What could not be published in time is left out, as a robot's sensors would.
+            next_frame = max(next_frame, now - 0.2) + 1.0 / self._rate_hz
             self.frames += 1
             self._distance += SPEED_M_S / RATE_HZ
             if int(self._distance / KEYFRAME_M) != sent_keyframes:

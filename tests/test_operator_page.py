@@ -138,6 +138,8 @@ def test_a_waypoint_is_set_on_the_map(page: Page, robot: PublishedRobot):
     page.mouse.click(box["x"] + 0.5 * box["width"], box["y"] + 0.6 * box["height"])
     page.get_by_test_id("ask").get_by_test_id("confirm").click()
     expect(page.get_by_test_id("command-result").first).to_contain_text("Add waypoint: done")
+    # While it fades, the dialog takes the pointer's clicks.
+    expect(page.get_by_test_id("ask")).to_have_count(0)
     [(x, y)] = robot.waypoints
     assert math.hypot(x - robot.pose()[0], y - robot.pose()[1]) < 3.0
 
