@@ -9,6 +9,8 @@ import socket
 import subprocess
 import sys
 import time
+import urllib.error
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -68,7 +70,7 @@ def address_of(process: subprocess.Popen[bytes], log: Path) -> str:
 def browser() -> Iterator[Browser]:
     """Chromium of the system. Where it is missing a test may be skipped by hand, never in CI."""
     if not Path(CHROMIUM).exists():
-        assert not os.environ.get("CI_RUN"), "chromium is missing: apt-get install chromium"
+        assert not os.environ.get("ROBOMINER_SLAM_CI"), "chromium is missing: apt-get install chromium"
         pytest.skip("chromium is missing: apt-get install chromium")
     with sync_playwright() as playwright:
         chromium = playwright.chromium.launch(executable_path=CHROMIUM, headless=True, args=FLAGS)
@@ -91,3 +93,11 @@ def stats(page: Page) -> dict[str, float]:
     """Frames drawn, latency (ms) and script time (ms) of the scene."""
     found: dict[str, float] = page.evaluate("window.robominerStream.stats")
     return found
+
+
+def status_of(address: str, **headers: str) -> int:
+    try:
+        with urllib.request.urlopen(urllib.request.Request(address, headers=headers), timeout=5.0) as answer:
+            return int(answer.status)
+    except urllib.error.HTTPError as error:
+        return error.code

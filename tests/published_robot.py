@@ -60,8 +60,10 @@ class PublishedRobot:
         obeys: whether commands are answered at all.
     """
 
-    def __init__(self, endpoint: str, *, remote: bool = False, points: int = 60, rate_hz: float = RATE_HZ) -> None:
-        self.endpoint, self._remote, self._points, self._rate_hz = endpoint, remote, points, rate_hz
+    def __init__(
+        self, endpoint: str, *, remote: bool = False, points: int = 60, keyframe_m: float = KEYFRAME_M
+    ) -> None:
+        self.endpoint, self._remote, self._points, self._keyframe_m = endpoint, remote, points, keyframe_m
         self.bend: dict[int, float] = dict.fromkeys(range(16, 24), math.radians(20.0))
         self.faults: dict[int, str] = {}
         self.health = Health.FINE
@@ -150,11 +152,11 @@ class PublishedRobot:
         while not self._stop.wait(max(0.0, next_frame - time.monotonic())):
             now = time.monotonic()
             # What could not be published in time is left out, as a robot's sensors would.
-            next_frame = max(next_frame, now - 0.2) + 1.0 / self._rate_hz
+            next_frame = max(next_frame, now - 0.2) + 1.0 / RATE_HZ
             self.frames += 1
             self._distance += SPEED_M_S / RATE_HZ
-            if int(self._distance / KEYFRAME_M) != sent_keyframes:
-                sent_keyframes = int(self._distance / KEYFRAME_M)
+            if int(self._distance / self._keyframe_m) != sent_keyframes:
+                sent_keyframes = int(self._distance / self._keyframe_m)
                 self.map_step()
             stamp = time.time_ns()
             if not self._remote or now >= next_pose:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
+import socket
 import subprocess
 import time
-import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +15,7 @@ from playwright.sync_api import Browser, expect
 
 from robominer_slam.publishing.bus_messages import QueryError
 from robominer_slam.publishing.zenoh_session import ZenohBus, ZenohSettings
-from tests.operator_page import PATIENCE_MS, browser, console, free_port, opened, program
+from tests.operator_page import PATIENCE_MS, browser, console, free_port, opened, program, status_of
 from tests.published_robot import PublishedRobot
 
 RECORDING = Path(__file__).parent / "recordings"
@@ -46,15 +46,7 @@ def test_telemetry_alone_is_enough_and_a_viewer_may_not_command(chromium: Browse
         page.close()
 
 
-def status_of(address: str, **headers: str) -> int:
-    try:
-        with urllib.request.urlopen(urllib.request.Request(address, headers=headers), timeout=5.0) as answer:
-            return int(answer.status)
-    except urllib.error.HTTPError as error:
-        return error.code
-
-
-def test_others_need_the_token_and_other_sites_get_nothing(chromium: Browser, tmp_path: Path):
+def test_beyond_loopback_the_token_is_needed(chromium: Browser, tmp_path: Path):
     with PublishedRobot(f"tcp/127.0.0.1:{free_port()}") as robot:
         options = ("--connect", robot.endpoint, "--host", "0.0.0.0", "--token", "secret")
         with console(tmp_path / "log", *options) as address:
@@ -66,10 +58,6 @@ def test_others_need_the_token_and_other_sites_get_nothing(chromium: Browser, tm
             expect(page.locator("body")).to_have_attribute("data-link", "live", timeout=PATIENCE_MS)
             assert "secret" not in page.url
             page.close()
-        with console(tmp_path / "log", "--connect", robot.endpoint) as address:
-            assert status_of(address) == 200
-            assert status_of(address, Origin="http://elsewhere.example") == 403
-            assert status_of(address, Host="elsewhere.example") == 403
 
 
 @pytest.mark.parametrize(
@@ -87,14 +75,12 @@ def test_mistakes_are_one_line_and_exit_code_2(arguments: list[str], expected: s
     assert "Traceback" not in done.stderr
 
 
-def test_a_port_in_use_is_said(tmp_path: Path):
-    with (
-        PublishedRobot(f"tcp/127.0.0.1:{free_port()}") as robot,
-        console(tmp_path / "log", "--connect", robot.endpoint) as a,
-    ):
-        port = a.rsplit(":", 1)[1].strip("/")
-        command = program("operator", "--connect", robot.endpoint, "--port", port)
-        done = subprocess.run(command, capture_output=True, text=True, timeout=30.0, check=False)
+def test_a_port_in_use_is_said():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        done = subprocess.run(
+            program("operator", "--port", port), capture_output=True, text=True, timeout=30.0, check=False
+        )
     assert done.returncode == 2
     assert f"--port {port}" in done.stderr
     assert "give another --port" in done.stderr

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from tests.operator_page import PATIENCE_MS, browser, console, free_port, opened, stats
+from tests.operator_page import PATIENCE_MS, browser, console, free_port, opened, stats, status_of
 from tests.published_robot import PublishedRobot
 
 
@@ -57,6 +57,12 @@ def test_the_map_appears_and_grows(page: Page, robot: PublishedRobot):
     low, high = (float(page.locator(".legend-ticks span").nth(k).inner_text()) for k in (4, 0))
     assert -0.2 < low < high < 0.0
     assert re.fullmatch(r"\d+ c?m", page.locator(".map-scale").inner_text())
+
+
+def test_other_sites_pages_get_nothing(page: Page):
+    assert status_of(page.url) == 200
+    assert status_of(page.url, Origin="http://elsewhere.example") == 403
+    assert status_of(page.url, Host="elsewhere.example") == 403
 
 
 def test_the_robot_moves_and_the_scene_is_drawn(page: Page, robot: PublishedRobot):

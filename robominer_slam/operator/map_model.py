@@ -15,7 +15,7 @@ from robominer_slam.publishing.map_state import MapState, StreamKeyframe
 FloatArray = NDArray[np.float64]
 
 #: Keyframes to a chunk: one draw call each, and what is sent again when one of them gets other points.
-CHUNK = 64
+CHUNK = 128
 #: Of the heights, which the colours run from and to: single wrong touches must not bleach the map.
 HEIGHT_PERCENTILES = (1.0, 99.0)
 #: Points of each keyframe that stand for all of it in the range of heights.

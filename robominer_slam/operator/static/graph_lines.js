@@ -26,26 +26,30 @@ export class GraphLines {
   }
 
   /** Keyframes lie at the robot's height, on which the whiskers hang. */
-  update(poses, slots) {
+  update(poses, slots, first = 0) {
     let values = this.places.getAttribute("position");
     if (!values || values.count < slots) {
       values = new THREE.BufferAttribute(new Float32Array(3 * Math.max(256, 2 * slots)), 3);
       this.places.setAttribute("position", values);
+      first = 0;
     }
-    let last = [0, 0, 0];
-    for (let k = 0; k < slots; k++) {
+    const to = values.array;
+    for (let k = first; k < slots; k++) {
       // A keyframe that has gone leaves no gap in the path.
-      if (poses[8 * k + 3] > 0.5) last = [poses[8 * k], poses[8 * k + 1], poses[8 * k + 2]];
-      values.array.set(last, 3 * k);
+      const there = poses[8 * k + 3] > 0.5 || k === 0;
+      for (let i = 0; i < 3; i++) to[3 * k + i] = there ? poses[8 * k + i] : to[3 * (k - 1) + i];
     }
+    values.addUpdateRange(3 * first, 3 * (slots - first));
     values.needsUpdate = true;
     this.count = slots;
-    this.updateClosures(poses);
+    // New keyframes at the end move no closure.
+    if (first < (this.lastPaired ?? 0)) this.updateClosures(poses);
     this.show(this.shown ?? slots);
   }
 
   setPairs(pairs, poses) {
     this.pairs = pairs;
+    this.lastPaired = pairs.reduce((most, slot) => Math.max(most, slot + 1), 0);
     this.updateClosures(poses);
   }
 

@@ -10,6 +10,15 @@ const EARLY_MS = 25;
 const LEAST_POINTS = 60000;
 const LAYERS = { points: "Points", path: "Path", keyframes: "Keyframes", closures: "Loop closures", trail: "Way driven", robot: "Robot" };
 
+/** Without a graphics card smooth edges cost more than they are worth. */
+function drawnInSoftware() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  const info = gl?.getExtension("WEBGL_debug_renderer_info");
+  const name = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
+  gl?.getExtension("WEBGL_lose_context")?.loseContext();
+  return /swiftshader|llvmpipe|software/i.test(name);
+}
+
 export default {
   template: `
     <div class="map-view" data-testid="map">
@@ -49,14 +58,14 @@ export default {
         </div>
       </div>
       <div class="map-compass" title="Axes of the map frame; its north is +y"><svg viewBox="-24 -24 48 48" ref="compass"><circle r="22"/><path d="M0,-17 L7,12 L0,7 L-7,12 Z"/></svg><span>N (map +y)</span></div>
-      <div class="map-corner"><div ref="scale" class="map-scale"></div><span class="map-count">{{ count }}</span></div>
+      <div class="map-corner"><div ref="scale" class="map-scale"></div><span ref="count" class="map-count"></span></div>
       <div class="map-empty" v-show="empty">No map yet: it grows where whiskers touch</div>
     </div>`,
   props: { dark: Boolean },
   data() {
     return {
       mode: "3d", follow: true, tool: null, waypoints: false, layersOpen: false, layers: LAYERS, palettes: Object.keys(COLOUR_MAPS),
-      palette: "viridis", heights: [0, 1], count: "", empty: true, shown: Object.fromEntries(Object.keys(LAYERS).map((name) => [name, true])),
+      palette: "viridis", heights: [0, 1], empty: true, shown: Object.fromEntries(Object.keys(LAYERS).map((name) => [name, true])),
     };
   },
   computed: {
@@ -73,8 +82,9 @@ export default {
     const canvas = this.$el.querySelector("canvas");
     // Kept out of Vue's sight: it must not watch a million points.
     const own = (this.own = Object.create(null));
-    own.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, powerPreference: "high-performance" });
-    own.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
+    const plain = drawnInSoftware();
+    own.renderer = new THREE.WebGLRenderer({ canvas, antialias: !plain, powerPreference: "high-performance" });
+    own.renderer.setPixelRatio(plain ? 1 : Math.min(window.devicePixelRatio, 2));
     own.scene = new THREE.Scene();
     own.cloud = new PointCloud();
     own.lines = new GraphLines();
@@ -120,14 +130,15 @@ export default {
         if (message.reset) cloud.clear();
         cloud.takeBounds(message.bounds, message.heights);
         this.own.slots = message.slots;
-        this.heights = message.heights;
+        // Vue draws the legend anew for every new array.
+        if (message.heights.some((value, k) => value !== this.heights[k])) this.heights = message.heights;
         this.own.points = message.points;
         this.empty = message.points === 0;
         this.tellCount();
       }));
       stream.on("poses", scene(({ first, values }) => {
         cloud.takePoses(first, values);
-        lines.update(cloud.poses, Math.max(this.own.slots, first + values.length / 8));
+        lines.update(cloud.poses, Math.max(this.own.slots, first + values.length / 8), first);
       }));
       stream.on("points", scene(({ chunk, points }) => {
         cloud.takePoints(chunk, points);
@@ -183,7 +194,8 @@ export default {
     tellCount() {
       const { points = 0, detail } = this.own;
       const share = detail < 1 ? `, ${Math.round(100 * detail)} % drawn` : "";
-      this.count = `${points.toLocaleString("en")} points${share}`;
+      const text = `${points.toLocaleString("en")} points${share}`;
+      if (this.$refs.count.textContent !== text) this.$refs.count.textContent = text;
     },
     resize() {
       const { clientWidth: width, clientHeight: height } = this.$el;

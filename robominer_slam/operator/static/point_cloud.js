@@ -3,7 +3,10 @@
 import { THREE } from "nicegui-scene";
 import { colourBytes } from "./colours.js";
 
-const CHUNK = 64;
+/** Keyframes to a chunk, as in `map_model.py`. */
+const CHUNK = 128;
+/** More rows than this are sent to the graphics as a whole. */
+const FEW_ROWS = 4;
 /** Slots to a row of the poses' texture; each takes two texels. */
 const ROW = 512;
 
@@ -86,6 +89,8 @@ export class PointCloud {
     this.poses = grown;
     this.texture?.dispose();
     this.texture = new THREE.DataTexture(grown, 2 * ROW, 2 * rows, THREE.RGBAFormat, THREE.FloatType);
+    this.texture.onUpdate = () => (this.uploaded = true);
+    this.uploaded = false;
     this.texture.needsUpdate = true;
     this.material.uniforms.poses.value = this.texture;
   }
@@ -94,13 +99,30 @@ export class PointCloud {
     for (const chunk of this.chunks) this.remove(chunk);
     this.chunks = [];
     this.poses.fill(0);
-    this.texture.needsUpdate = true;
+    this.upload(0, this.poses.length / 8);
   }
 
   takePoses(first, values) {
     this.reserve(first + values.length / 8);
     this.poses.set(values, 8 * first);
-    this.texture.needsUpdate = true;
+    this.upload(first, values.length / 8);
+  }
+
+  /** Bring poses to the graphics: of a few keyframes only these, row by row. */
+  upload(first, count) {
+    const texture = this.texture;
+    const rows = Math.floor((first + count - 1) / ROW) - Math.floor(first / ROW) + 1;
+    if (!this.uploaded || rows > FEW_ROWS) {
+      texture.clearUpdateRanges();
+      this.uploaded = false;
+    } else {
+      for (let slot = first; slot < first + count; ) {
+        const end = Math.min(first + count, (Math.floor(slot / ROW) + 1) * ROW);
+        texture.addUpdateRange(8 * slot, 8 * (end - slot));
+        slot = end;
+      }
+    }
+    texture.needsUpdate = true;
   }
 
   takePoints(index, points) {
@@ -126,10 +148,14 @@ export class PointCloud {
   }
 
   takeBounds(bounds, heights) {
-    this.spheres = bounds.map(([x, y, z, radius]) => new THREE.Sphere(new THREE.Vector3(x, y, z), radius));
-    this.chunks.forEach((object, k) => {
-      if (object && this.spheres[k]) object.geometry.boundingSphere = this.spheres[k];
+    this.spheres ??= [];
+    bounds.forEach(([x, y, z, radius], k) => {
+      this.spheres[k] ??= new THREE.Sphere();
+      this.spheres[k].center.set(x, y, z);
+      this.spheres[k].radius = radius;
+      if (this.chunks[k]) this.chunks[k].geometry.boundingSphere = this.spheres[k];
     });
+    this.spheres.length = bounds.length;
     this.material.uniforms.heights.value.set(...heights);
   }
 

@@ -4,6 +4,9 @@ import { stream } from "robominer-console";
 const STATE_LEVELS = { tracking: "good", dead_reckoning: "fair", relocalizing: "fair", lost: "bad", "": "none" };
 const LINK_WORDS = { none: "waiting for the robot", live: "live", recording: "recording" };
 
+/** Figures are written so often, ms: faster ones cannot be read. */
+const WRITE_MS = 100;
+
 function write(field, text) {
   for (const element of document.querySelectorAll(`[data-field="${field}"]`)) if (element.textContent !== text) element.textContent = text;
 }
@@ -30,7 +33,11 @@ export default {
       frames = stream.stats.frames;
       if (stream.stats.latency !== null) write("latency_page", `${Math.round(stream.stats.latency)} ms`);
     }, 1000);
+    let writtenAt = 0;
     stream.on("live", ({ place, state, past }) => {
+      const now = performance.now();
+      if (now - writtenAt < WRITE_MS && !past) return;
+      writtenAt = now;
       for (const [field, text] of Object.entries(place)) write(field, text);
       document.body.dataset.state = STATE_LEVELS[state] ?? "none";
       document.body.dataset.showing = past ? "past" : "now";
