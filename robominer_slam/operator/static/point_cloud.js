@@ -1,15 +1,11 @@
 // The map's points. Each stays in its keyframe's frame; the vertex shader moves it with the keyframe's pose, which
-// lies in a texture: a corrected graph costs one small texture, however many points there are.
+// lies in a texture: a corrected graph costs some small textures, however many points there are. Every chunk has a
+// texture of its own, because part of a texture cannot be replaced without waiting for the graphics.
 import { THREE } from "nicegui-scene";
 import { colourBytes } from "./colours.js";
 
 /** Keyframes to a chunk, as in `map_model.py`. */
 const CHUNK = 128;
-/** More rows than this are sent to the graphics as a whole. */
-const FEW_ROWS = 4;
-/** Slots to a row of the poses' texture; each takes two texels. */
-const ROW = 512;
-
 const VERTEX = `
 precision highp float;
 precision highp int;
@@ -21,15 +17,14 @@ uniform float size, pixels;
 in vec4 position;
 out float height;
 void main() {
-  int slot = firstSlot + int(position.w);
-  ivec2 at = ivec2(2 * (slot % ${ROW}), slot / ${ROW});
-  vec4 place = texelFetch(poses, at, 0);
-  vec4 q = texelFetch(poses, at + ivec2(1, 0), 0);
+  int slot = int(position.w);
+  vec4 place = texelFetch(poses, ivec2(2 * slot, 0), 0);
+  vec4 q = texelFetch(poses, ivec2(2 * slot + 1, 0), 0);
   vec3 v = 0.001 * position.xyz;
   vec3 point = v + 2.0 * cross(q.xyz, cross(q.xyz, v) + q.w * v) + place.xyz;
   height = point.z;
   vec4 seen = projectionMatrix * (modelViewMatrix * vec4(point, 1.0));
-  bool shown = slot < slotsShown && place.w > 0.5;
+  bool shown = firstSlot + slot < slotsShown && place.w > 0.5;
   gl_Position = shown ? seen : vec4(2.0, 2.0, 2.0, 1.0);
   // As large as they are in the world, but never too small to be seen.
   gl_PointSize = clamp(size * pixels / seen.w, 2.0, 12.0);
@@ -51,8 +46,8 @@ export class PointCloud {
   constructor() {
     this.group = new THREE.Group();
     this.chunks = [];
+    this.textures = [];
     this.poses = new Float32Array(0);
-    this.slots = 0;
     this.material = new THREE.RawShaderMaterial({
       glslVersion: THREE.GLSL3,
       vertexShader: VERTEX,
@@ -68,7 +63,6 @@ export class PointCloud {
         faded: { value: 0 },
       },
     });
-    this.reserve(ROW);
     this.setColours("viridis");
   }
 
@@ -80,59 +74,48 @@ export class PointCloud {
     this.material.uniforms.colours.value = texture;
   }
 
-  /** Room for so many keyframes' poses. */
+  /** Room for so many keyframes' poses: all of them in a row, and by chunk for the graphics. */
   reserve(slots) {
-    const rows = Math.ceil(slots / ROW);
-    if (this.poses.length >= rows * ROW * 8) return;
-    const grown = new Float32Array(2 * rows * ROW * 8);
+    while (this.textures.length * CHUNK < slots) {
+      const texture = new THREE.DataTexture(new Float32Array(8 * CHUNK), 2 * CHUNK, 1, THREE.RGBAFormat, THREE.FloatType);
+      texture.needsUpdate = true;
+      this.textures.push(texture);
+    }
+    if (this.poses.length >= 8 * slots) return;
+    const grown = new Float32Array(16 * slots);
     grown.set(this.poses);
     this.poses = grown;
-    this.texture?.dispose();
-    this.texture = new THREE.DataTexture(grown, 2 * ROW, 2 * rows, THREE.RGBAFormat, THREE.FloatType);
-    this.texture.onUpdate = () => (this.uploaded = true);
-    this.uploaded = false;
-    this.texture.needsUpdate = true;
-    this.material.uniforms.poses.value = this.texture;
   }
 
   clear() {
     for (const chunk of this.chunks) this.remove(chunk);
+    for (const texture of this.textures) texture.dispose();
     this.chunks = [];
+    this.textures = [];
     this.poses.fill(0);
-    this.upload(0, this.poses.length / 8);
   }
 
   takePoses(first, values) {
-    this.reserve(first + values.length / 8);
+    const count = values.length / 8;
+    this.reserve(first + count);
     this.poses.set(values, 8 * first);
-    this.upload(first, values.length / 8);
-  }
-
-  /** Bring poses to the graphics: of a few keyframes only these, row by row. */
-  upload(first, count) {
-    const texture = this.texture;
-    const rows = Math.floor((first + count - 1) / ROW) - Math.floor(first / ROW) + 1;
-    if (!this.uploaded || rows > FEW_ROWS) {
-      texture.clearUpdateRanges();
-      this.uploaded = false;
-    } else {
-      for (let slot = first; slot < first + count; ) {
-        const end = Math.min(first + count, (Math.floor(slot / ROW) + 1) * ROW);
-        texture.addUpdateRange(8 * slot, 8 * (end - slot));
-        slot = end;
-      }
+    for (let k = Math.floor(first / CHUNK); k * CHUNK < first + count; k++) {
+      const texture = this.textures[k];
+      texture.image.data.set(this.poses.subarray(8 * CHUNK * k, 8 * CHUNK * (k + 1)));
+      texture.needsUpdate = true;
     }
-    texture.needsUpdate = true;
   }
 
   takePoints(index, points) {
     this.remove(this.chunks[index]);
+    this.reserve((index + 1) * CHUNK);
     const geometry = new THREE.BufferGeometry();
     geometry.setAttribute("position", new THREE.BufferAttribute(points, 4));
     geometry.boundingSphere = this.spheres?.[index] ?? new THREE.Sphere(new THREE.Vector3(), Infinity);
     const object = new THREE.Points(geometry, this.material);
     object.onBeforeRender = () => {
       this.material.uniforms.firstSlot.value = index * CHUNK;
+      this.material.uniforms.poses.value = this.textures[index];
       this.material.uniformsNeedUpdate = true;
     };
     // Nothing moves as an object: its matrix need not be looked at.
