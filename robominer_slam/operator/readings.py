@@ -39,10 +39,11 @@ def place_fields(frame: LiveFrame | None) -> dict[str, str]:
     valid = int(np.isfinite(frame.inclination).sum())
     return {
         "state": STATE_WORDS.get(frame.state, frame.state),
-        "x": f"{frame.pose[0]:.2f} m",
-        "y": f"{frame.pose[1]:.2f} m",
-        "z": f"{frame.pose[2]:.2f} m",
-        "heading": f"{heading:.1f}°",
+        # Adding zero makes -0 a plain 0.
+        "x": f"{round(float(frame.pose[0]), 2) + 0.0:.2f} m",
+        "y": f"{round(float(frame.pose[1]), 2) + 0.0:.2f} m",
+        "z": f"{round(float(frame.pose[2]), 2) + 0.0:.2f} m",
+        "heading": f"{round(heading, 1) + 0.0:.1f}°",
         "sigma": f"± {100.0 * sigma:.1f} cm" if sigma < UNKNOWN_SIGMA_M else "unknown",
         "sigma_heading": f"± {math.degrees(math.sqrt(max(yaw, 0.0))):.1f}°",
         "touching": f"{frame.touching} of {valid} usable" if len(frame.inclination) else NOTHING,

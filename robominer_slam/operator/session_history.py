@@ -1,4 +1,4 @@
-"""The session so far, for scrubbing back: frames at up to 10 Hz in memory of fixed size."""
+"""The session so far, for scrubbing back: in memory of fixed size, the last minutes at 10 Hz, all of it evenly."""
 
 from __future__ import annotations
 
@@ -7,8 +7,12 @@ import numpy as np
 from robominer_slam.operator.live_frame import LiveFrame
 from robominer_slam.publishing.telemetry import STATES
 
-#: An hour at 10 Hz; when it is full, every second frame of the older half goes.
+#: An hour at 10 Hz; when it is full, frames older than the last minutes are thinned.
 CAPACITY = 36_000
+#: Share of the capacity, the newest frames, that is never thinned.
+_RECENT = 0.15
+#: Share that is to be in use after thinning.
+_ROOM = 0.75
 INTERVAL_NS = 100_000_000
 _UNKNOWN = len(STATES)
 
@@ -24,6 +28,7 @@ class SessionHistory:
     def __init__(self, capacity: int = CAPACITY, interval_ns: int = INTERVAL_NS) -> None:
         self._capacity, self._interval_ns = capacity, interval_ns
         self._count = 0
+        self._spacing_ns = interval_ns
         self._stamp = np.zeros(capacity, dtype=np.int64)
         self._pose = np.zeros((capacity, 7))
         self._covariance = np.zeros((capacity, 4), dtype=np.float32)
@@ -93,8 +98,17 @@ class SessionHistory:
         return np.column_stack([(stamps[first:last] - end_ns) * 1e-9, angles])
 
     def _thin(self) -> None:
-        half = self._capacity // 2
-        kept = np.concatenate([np.arange(0, half, 2), np.arange(half, self._capacity)])
-        self._count = len(kept)
+        """Older frames are kept farther apart, all of them alike: the spacing grows until there is room again."""
+        recent = self._count - int(_RECENT * self._capacity)
+        while True:
+            self._spacing_ns *= 2
+            kept, at = [], 0
+            while at < recent:
+                kept.append(at)
+                at = int(np.searchsorted(self._stamp[:recent], self._stamp[at] + self._spacing_ns))
+            if len(kept) + self._count - recent <= _ROOM * self._capacity:
+                break
+        chosen = np.concatenate([np.array(kept, dtype=np.intp), np.arange(recent, self._count)])
+        self._count = len(chosen)
         for values in (self._stamp, self._pose, self._covariance, self._state, self._angles):
-            values[: self._count] = values[kept]
+            values[: self._count] = values[chosen]
