@@ -101,13 +101,13 @@ class SessionHistory:
         """Older frames are kept farther apart, all of them alike: the spacing grows until there is room again."""
         recent = self._count - int(_RECENT * self._capacity)
         while True:
-            self._spacing_ns *= 2
             kept, at = [], 0
             while at < recent:
                 kept.append(at)
                 at = int(np.searchsorted(self._stamp[:recent], self._stamp[at] + self._spacing_ns))
             if len(kept) + self._count - recent <= _ROOM * self._capacity:
                 break
+            self._spacing_ns *= 2
         chosen = np.concatenate([np.array(kept, dtype=np.intp), np.arange(recent, self._count)])
         self._count = len(chosen)
         for values in (self._stamp, self._pose, self._covariance, self._state, self._angles):
