@@ -34,7 +34,7 @@ def build_page(session: Session) -> None:
     ReadOuts()
     with ui.element("div").classes("console"):
         with ui.element("header").classes("top-bar"):
-            _header(session, dark)
+            keys = _header(session, dark)
         with ui.element("main").classes("stage"):
             map_view = MapView()
             map_view.props["dark"] = True
@@ -55,6 +55,7 @@ def build_page(session: Session) -> None:
             help_dialog.open()
 
     keyboard.on("key", on_key)
+    keys.on_click(help_dialog.open)
 
 
 def _set_dark(map_view: MapView, *, dark: bool) -> None:
@@ -62,7 +63,7 @@ def _set_dark(map_view: MapView, *, dark: bool) -> None:
     map_view.update()
 
 
-def _header(session: Session, dark: ui.dark_mode) -> None:
+def _header(session: Session, dark: ui.dark_mode) -> ui.button:
     ui.html(f"<h1>{session.robot}</h1>", sanitize=False)
     for name, title in (("state", "Localisation"), ("link", "Link"), ("fault_count", "Faults")):
         with ui.element("div").classes(f"pill pill-{name}").props(f'title="{title}" role=status data-testid={name}'):
@@ -74,7 +75,9 @@ def _header(session: Session, dark: ui.dark_mode) -> None:
                 ui.label(label)
                 _field(name)
     ui.element("div").classes("spring")
-    ui.button("Dark / light", on_click=dark.toggle).props("flat dense no-caps").classes("plain")
+    keys = ui.button("Keys", color=None).props("flat dense no-caps").classes("plain")
+    ui.button("Dark / light", on_click=dark.toggle, color=None).props("flat dense no-caps").classes("plain")
+    return keys
 
 
 def _field(name: str) -> None:

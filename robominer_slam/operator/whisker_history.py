@@ -64,6 +64,7 @@ def _options() -> dict[str, object]:
         "nameGap": 34,
         "axisLabel": {"color": "#8a98a6"},
         "nameTextStyle": {"color": "#8a98a6"},
+        "splitLine": {"lineStyle": {"color": "#8a98a640"}},
     }
     line = {"type": "line", "showSymbol": False, "connectNulls": False, "data": []}
     return {
@@ -73,7 +74,7 @@ def _options() -> dict[str, object]:
         "tooltip": {"trigger": "axis"},
         "xAxis": {"type": "value", "min": -SECONDS, "max": 0, "name": "time (s)", **axis, "nameGap": 26},
         "yAxis": [
-            {"type": "value", "min": 0, "max": 90, "name": "inclination (°)", **axis},
+            {"type": "value", "min": 0, "max": 90, "interval": 30, "name": "inclination (°)", **axis},
             {
                 "type": "value",
                 "min": -180,
@@ -86,6 +87,6 @@ def _options() -> dict[str, object]:
         ],
         "series": [
             {**line, "name": "inclination", "color": _INCLINATION, "step": "end"},
-            {**line, "name": "azimuth", "color": _AZIMUTH, "yAxisIndex": 1, "lineStyle": {"type": "dashed"}},
+            {"type": "scatter", "symbolSize": 3, "data": [], "name": "azimuth", "color": _AZIMUTH, "yAxisIndex": 1},
         ],
     }

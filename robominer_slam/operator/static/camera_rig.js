@@ -3,13 +3,13 @@ import { OrbitControls, THREE } from "nicegui-scene";
 
 const FIELD_OF_VIEW = 50;
 /** What a camera shows at first, m across. */
-const FIRST_WIDTH = 4;
+const FIRST_WIDTH = 3;
 
 export class CameraRig {
   constructor(element, onChange) {
     this.perspective = new THREE.PerspectiveCamera(FIELD_OF_VIEW, 1, 0.05, 5000);
     this.perspective.up.set(0, 0, 1);
-    this.perspective.position.set(-2.2, -2.2, 2.2);
+    this.perspective.position.set(-1.3, -1.3, 1.4);
     this.above = new THREE.OrthographicCamera(-1, 1, 1, -1, -1000, 5000);
     this.above.position.set(0, 0, 1000);
     this.orbit = new OrbitControls(this.perspective, element);

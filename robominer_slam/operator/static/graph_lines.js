@@ -1,6 +1,10 @@
 // Keyframes, the path through them, loop closures, and the way driven.
 import { THREE } from "nicegui-scene";
 
+/** Loop closures are arcs, so that they are told from the path: so many lines each, and so high for their length. */
+const ARC_LINES = 8;
+const ARC_HEIGHT = 0.25;
+
 export class GraphLines {
   constructor() {
     this.group = new THREE.Group();
@@ -54,11 +58,16 @@ export class GraphLines {
   }
 
   updateClosures(poses) {
-    const positions = new Float32Array(3 * this.pairs.length);
-    this.pairs.forEach((slot, k) => positions.set(poses.subarray(8 * slot, 8 * slot + 3), 3 * k));
+    const positions = [];
+    for (let k = 0; k < this.pairs.length; k += 2) {
+      const [i, j] = [8 * this.pairs[k], 8 * this.pairs[k + 1]];
+      const rise = ARC_HEIGHT * Math.hypot(poses[j] - poses[i], poses[j + 1] - poses[i + 1]) + 0.02;
+      const at = (share) => [0, 1, 2].map((m) => poses[i + m] + share * (poses[j + m] - poses[i + m]) + (m === 2 ? 4 * rise * share * (1 - share) : 0));
+      for (let n = 0; n < ARC_LINES; n++) positions.push(...at(n / ARC_LINES), ...at((n + 1) / ARC_LINES));
+    }
     this.closures.geometry.dispose();
     this.closures.geometry = new THREE.BufferGeometry();
-    this.closures.geometry.setAttribute("position", new THREE.BufferAttribute(positions, 3));
+    this.closures.geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(positions), 3));
     this.show(this.shown ?? Infinity);
   }
 
@@ -68,7 +77,7 @@ export class GraphLines {
     this.places.setDrawRange(0, Math.min(slots, this.count ?? 0));
     let pairs = 0;
     while (pairs < this.pairs.length && Math.max(this.pairs[pairs], this.pairs[pairs + 1]) < slots) pairs += 2;
-    this.closures.geometry.setDrawRange(0, pairs);
+    this.closures.geometry.setDrawRange(0, pairs * ARC_LINES);
   }
 
   /** `points`: seconds, x, y, z of places driven through, flat. */

@@ -3,6 +3,7 @@ export { stream } from "./stream.js";
 export { CameraRig } from "./camera_rig.js";
 export { COLOUR_MAPS, gradient } from "./colours.js";
 export { GraphLines } from "./graph_lines.js";
+export { GroundGrid } from "./ground_grid.js";
 export { MapTools } from "./map_tools.js";
 export { PointCloud } from "./point_cloud.js";
 export { RobotModel } from "./robot_model.js";

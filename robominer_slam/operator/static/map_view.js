@@ -1,6 +1,6 @@
 // The map: a scene that is drawn when something in it has changed, and the tools over it.
 import { THREE } from "nicegui-scene";
-import { CameraRig, COLOUR_MAPS, drawScaleBar, GraphLines, gradient, MapTools, PointCloud, RobotModel, stream } from "robominer-console";
+import { CameraRig, COLOUR_MAPS, drawScaleBar, GraphLines, gradient, GroundGrid, MapTools, PointCloud, RobotModel, stream } from "robominer-console";
 import { sceneColours } from "robominer-console/colours.js";
 
 /** Between being asked for a drawing and drawing: above the first the graphics are overloaded, below the second not. */
@@ -89,14 +89,13 @@ export default {
     own.cloud = new PointCloud();
     own.lines = new GraphLines();
     own.robot = new RobotModel();
-    own.grid = new THREE.GridHelper(200, 200);
-    own.grid.rotation.x = Math.PI / 2;
+    own.grid = new GroundGrid();
     own.rig = new CameraRig(canvas, () => this.render());
     own.tools = new MapTools({
       canvas, labels: this.$refs.labels, hint: this.$refs.hint, rig: own.rig, cloud: own.cloud, render: () => this.render(),
       onPlace: (place) => this.$emit("place", place), onDone: (tool) => (this.tool = tool),
     });
-    own.scene.add(own.grid, own.cloud.group, own.lines.group, own.robot.group, own.robot.ellipse, own.tools.group);
+    own.scene.add(own.grid.object, own.cloud.group, own.lines.group, own.robot.group, own.robot.ellipse, own.tools.group);
     own.detail = 1;
     this.setDark(this.dark);
     new ResizeObserver(() => this.resize()).observe(this.$el);
@@ -130,6 +129,7 @@ export default {
         if (message.reset) cloud.clear();
         cloud.takeBounds(message.bounds, message.heights);
         this.own.slots = message.slots;
+        this.own.low = message.heights[0] - 0.02;
         // Vue draws the legend anew for every new array.
         if (message.heights.some((value, k) => value !== this.heights[k])) this.heights = message.heights;
         this.own.points = message.points;
@@ -166,6 +166,7 @@ export default {
       own.asked = null;
       if (!own.rig.width) return;
       own.cloud.material.uniforms.pixels.value = own.rig.pixelsPerMetre() * own.renderer.getPixelRatio();
+      own.grid.moveTo(own.rig.controls.target, this.own.low ?? 0);
       own.renderer.render(own.scene, own.rig.camera);
       own.tools.placeLabels();
       drawScaleBar(this.$refs.scale, own.rig.metresPerPixel());
@@ -207,9 +208,7 @@ export default {
       const own = this.own;
       const colours = sceneColours(dark);
       own.scene.background = new THREE.Color(colours.background);
-      own.grid.material.vertexColors = false;
-      own.grid.material.color.set(colours.grid);
-      own.grid.material.needsUpdate = true;
+      own.grid.setColours(colours);
       own.robot.setColours(colours);
       own.lines.setColours(colours);
       own.tools.colour.set(colours.tool);

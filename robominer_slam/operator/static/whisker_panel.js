@@ -45,7 +45,7 @@ export default {
       const [xs, ys] = [seen.map((p) => p[0]), seen.map((p) => p[1])];
       let gap = Infinity;
       for (const [x, y, k] of seen) for (const [u, v, m] of seen) if (m < k) gap = Math.min(gap, Math.hypot(x - u, y - v));
-      this.radius = 0.46 * Math.min(gap, 80);
+      this.radius = 0.42 * Math.min(gap, 80);
       const rim = 2.2 * this.radius;
       const [left, top] = [Math.min(...xs) - rim, Math.min(...ys) - rim - 18];
       this.box = `${left} ${top} ${Math.max(...xs) + rim - left} ${Math.max(...ys) + rim - top}`;
@@ -82,7 +82,7 @@ export default {
       const R = this.array.rotation[k];
       // Where the tip goes, in base_link: forward is up on the panel, left is left.
       const [forward, left] = [0, 1].map((i) => R[3 * i] * Math.cos(angle) + R[3 * i + 1] * Math.sin(angle));
-      const reach = 1.5 * this.radius * Math.min(1, inclination / FULL_BEND);
+      const reach = 1.7 * this.radius * Math.min(1, inclination / FULL_BEND);
       const level = Math.hypot(forward, left) || 1;
       mark.line.setAttribute("x2", ((-left / level) * reach).toFixed(1));
       mark.line.setAttribute("y2", ((-forward / level) * reach).toFixed(1));
