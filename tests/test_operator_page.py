@@ -193,7 +193,7 @@ def test_a_cut_link_is_stale_within_a_second_and_recovers(page: Page, robot: Pub
     robot.stop()
     body_has(page, "link", "stale")
     assert page.evaluate("window.staleAt") < 1000.0
-    expect(field(page, "link")).to_contain_text("no data for")
+    expect(field(page, "link")).to_contain_text("no data for", timeout=PATIENCE_MS)
     assert float(page.locator(".header-figures").evaluate("e => getComputedStyle(e).opacity")) < 0.5
     page.get_by_role("tab", name="Robot and link").click()
     robot.start()

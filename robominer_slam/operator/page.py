@@ -84,8 +84,8 @@ def _field(name: str) -> None:
     ui.element("b").props(f"data-field={name}")
 
 
-def _figures(rows: tuple[tuple[str, str], ...]) -> None:
-    with ui.element("dl").classes("figures follows-link"):
+def _figures(rows: tuple[tuple[str, str], ...], follows: str = "link") -> None:
+    with ui.element("dl").classes(f"figures follows-{follows}"):
         for label, name in rows:
             with ui.element("dt"):
                 ui.label(label)
@@ -116,7 +116,7 @@ def _side(session: Session) -> CommandPanel:
                 panel.drive_commands()
         with ui.tab_panel(robot):
             with _card("Faults"):
-                ui.element("ul").props("id=faults data-testid=faults").classes("list follows-link")
+                ui.element("ul").props("id=faults data-testid=faults").classes("list follows-status")
             with _card("Link"):
                 _figures(
                     (("last heard", "heard"), ("latency, robot to here", "latency"),
@@ -128,10 +128,10 @@ def _side(session: Session) -> CommandPanel:
             with _card("Robot's computer"):
                 _figures(
                     (("CPU", "cpu"), ("memory", "memory"), ("disk", "disk"), ("map store", "store"),
-                     ("clock", "clock"), ("device clocks", "device_clocks"))
+                     ("clock", "clock"), ("device clocks", "device_clocks")), "status"
                 )  # fmt: skip
             with _card("Devices"):
-                ui.element("ul").props("id=devices").classes("list follows-link")
+                ui.element("ul").props("id=devices").classes("list follows-status")
         with ui.tab_panel(log):
             with _card("Map"):
                 _figures(

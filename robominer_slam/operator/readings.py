@@ -146,6 +146,7 @@ def readings(view: RobotView, meter: ProcessorMeter) -> dict[str, object]:
             "devices": devices(view),
             "events": [[event.stamp_ns // 1_000_000, event.text] for event in list(view.events)[-50:]],
             "age": view.traffic.live_age_s(now),
+            "status_age": view.traffic.age_s("status", now),
             "progress": view.progress,
             "waypoints": view.waypoints,
             "paused": bool(view.health() & view.health().PAUSED),

@@ -53,8 +53,8 @@ export default {
       if (progress !== null) LINK_WORDS.recording = progress < 1 ? `reading ${Math.round(100 * progress)} %` : "recording";
       write("link", LINK_WORDS[document.body.dataset.link] ?? document.querySelector('[data-field="link"]')?.textContent ?? "");
     });
-    stream.on("link", ({ state, age, console }) => {
-      const silent = console === false ? "no answer from the console" : age === null ? "no data" : `no data for ${(age / 1000).toFixed(1)} s`;
+    stream.on("link", ({ state, age, heard, console }) => {
+      const silent = console === false ? "no answer from the console" : age === null ? "no data" : `no ${heard ? "poses" : "data"} for ${(age / 1000).toFixed(1)} s`;
       write("link", LINK_WORDS[state] ?? silent);
     });
   },

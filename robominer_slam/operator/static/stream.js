@@ -2,6 +2,9 @@
 
 /** Without news of the robot for this long the page shows everything as stale, ms. */
 const STALE_MS = 800;
+/** Status comes once a second on the robot, and at least every ten on a remote link. */
+const STATUS_OLD_MS = 12500;
+const STATUS_YOUNG_MS = 2500;
 const RETRY_MS = 500;
 const POINTS = 1;
 const POSES = 2;
@@ -85,9 +88,14 @@ class Stream {
       // A console that does not answer is as stale as a robot that does not.
       state = age > STALE_MS || silence > 2 * STALE_MS ? "stale" : "live";
     } else if (this.readings && silence > STALE_MS) state = "stale";
+    const statusAge = this.readings?.status_age == null ? Infinity : 1000 * this.readings.status_age + silence;
+    // Poses may end while the robot's program goes on and says why.
+    const heard = statusAge < STATUS_YOUNG_MS && silence < 2 * STALE_MS;
     document.body.dataset.link = state;
+    document.body.dataset.status = state === "recording" || statusAge < STATUS_OLD_MS ? "fresh" : "stale";
+    document.body.dataset.heard = heard;
     const changed = state !== this.link.state;
-    this.link = { state, age, console: silence < 2 * STALE_MS };
+    this.link = { state, age, heard, console: silence < 2 * STALE_MS };
     if (changed || state === "stale") this.emit("link", this.link);
   }
 }
