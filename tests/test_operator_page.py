@@ -187,11 +187,13 @@ def test_the_past_is_shown_and_now_comes_back(page: Page, robot: PublishedRobot)
 
 def test_a_cut_link_is_stale_within_a_second_and_recovers(page: Page, robot: PublishedRobot):
     body_has(page, "link", "live")
-    page.evaluate("""() => { window.staleAt = null; const watch = () => {
-        if (document.body.dataset.link === 'stale') window.staleAt = performance.now() - window.robominerStream.heardAt;
-        else requestAnimationFrame(watch); }; watch(); }""")
+    page.evaluate("""() => { window.staleAt = null; new MutationObserver(() => {
+        const stale = document.body.dataset.link === 'stale';
+        if (stale) window.staleAt ??= performance.now() - window.robominerStream.heardAt;
+    }).observe(document.body, {attributes: true}); }""")
     robot.stop()
     body_has(page, "link", "stale")
+    page.wait_for_function("window.staleAt !== null")
     assert page.evaluate("window.staleAt") < 1000.0
     expect(field(page, "link")).to_contain_text("no data for", timeout=PATIENCE_MS)
     assert float(page.locator(".header-figures").evaluate("e => getComputedStyle(e).opacity")) < 0.5

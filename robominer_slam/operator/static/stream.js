@@ -1,7 +1,7 @@
 // The page's one WebSocket: hands messages to who listens, connects again by itself, and knows how old all is.
 
 /** Without news of the robot for this long the page shows everything as stale, ms. */
-const STALE_MS = 800;
+const STALE_MS = 700;
 /** Status comes once a second on the robot, and at least every ten on a remote link. */
 const STATUS_OLD_MS = 12500;
 const STATUS_YOUNG_MS = 2500;
