@@ -183,6 +183,12 @@ class PublishedRobot:
         for message in self._encoder.update(self.version, keyframes, poses):
             self._bus.put("map/updates", message)
 
+    def begin_map(self) -> None:
+        """Another map, empty at first."""
+        with self.lock:
+            self._encoder = MapStreamEncoder(0x5678)
+            self.publish_map([], np.zeros((0, 7)))
+
     def preload(self, keyframes: list[MadeKeyframe], poses: np.ndarray) -> None:
         """A map that is there before the robot is switched on."""
         self.keyframes, self.poses = keyframes, poses

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import socket
 import subprocess
+import sys
 import time
 import urllib.request
 from collections.abc import Iterator
@@ -73,6 +74,14 @@ def test_mistakes_are_one_line_and_exit_code_2(arguments: list[str], expected: s
     assert done.returncode == 2, done.stderr
     assert expected in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_a_missing_extra_is_said():
+    code = "import sys; sys.modules['nicegui'] = None; from robominer_slam.cli.main import main; main()"
+    command = [sys.executable, "-c", code, "operator"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=30.0, check=False)
+    assert done.returncode == 2
+    assert "pip install 'robominer-slam[operator]'" in done.stderr
 
 
 def test_a_port_in_use_is_said():

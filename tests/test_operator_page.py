@@ -185,6 +185,14 @@ def test_the_past_is_shown_and_now_comes_back(page: Page, robot: PublishedRobot)
     body_has(page, "showing", "now")
 
 
+def test_another_map_takes_the_place_of_the_old_one(page: Page, robot: PublishedRobot):
+    shown = "parseInt(document.querySelector('.map-count').textContent.replace(',', ''))"
+    before = page.evaluate(shown)
+    robot.begin_map()
+    page.wait_for_function(f"(b) => {shown} < b / 2", arg=before)
+    page.wait_for_function(f"{shown} > 0")
+
+
 def test_a_cut_link_is_stale_within_a_second_and_recovers(page: Page, robot: PublishedRobot):
     body_has(page, "link", "live")
     page.evaluate("""() => { window.staleAt = null; new MutationObserver(() => {

@@ -84,6 +84,7 @@ def test_history_is_bounded_and_finds_any_moment():
     old = history.at(500 * SECOND)
     assert abs(old.pose[0] - 500.0) < 30.0
     assert history.trail(20).shape == (20, 4)
+    assert history.trail(20, 990 * SECOND)[:, 1].tolist() == [float(x) for x in range(990, 1000)]
     last = history.whisker(2, 999 * SECOND, 10.0)
     assert (last[:, 0] >= -10.0).all()
     assert np.allclose(last[:, 1], 0.5, atol=1e-3)

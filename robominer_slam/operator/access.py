@@ -7,9 +7,9 @@ import ipaddress
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs, urlsplit
 
-from starlette.datastructures import Headers
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse, RedirectResponse
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 COOKIE = "robominer_operator"
 #: WebSocket close code for a refusal.
@@ -48,7 +48,7 @@ class AccessGuard:
         elif self._token is None and not is_loopback(urlsplit(f"//{host}").hostname or ""):
             await _refuse(scope, receive, send, 403, "this console answers to localhost only")
         elif self._token is None or self._matches(_cookie(headers)):
-            await self._app(scope, receive, send)
+            await self._app(scope, receive, _unframed(send))
         elif scope["type"] == "http" and self._matches(_asked(scope)):
             # The token goes into a cookie and out of the address, where others would see it.
             response = RedirectResponse(scope["path"], status_code=303)
@@ -59,6 +59,17 @@ class AccessGuard:
 
     def _matches(self, offered: str) -> bool:
         return self._token is not None and hmac.compare_digest(offered.encode(), self._token.encode())
+
+
+def _unframed(send: Send) -> Send:
+    """Answers that no other page may show inside itself: clicks on that one would command the robot."""
+
+    async def sending(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            MutableHeaders(scope=message)["Content-Security-Policy"] = "frame-ancestors 'none'"
+        await send(message)
+
+    return sending
 
 
 def _cookie(headers: Headers) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from html import escape
 from typing import Any
 
 from nicegui import events, ui
@@ -64,7 +65,7 @@ def _set_dark(map_view: MapView, *, dark: bool) -> None:
 
 
 def _header(session: Session, dark: ui.dark_mode) -> ui.button:
-    ui.html(f"<h1>{session.robot}</h1>", sanitize=False)
+    ui.html(f"<h1>{escape(session.robot)}</h1>", sanitize=False)
     for name, title in (("state", "Localisation"), ("link", "Link"), ("fault_count", "Faults")):
         with ui.element("div").classes(f"pill pill-{name}").props(f'title="{title}" role=status data-testid={name}'):
             ui.element("i")

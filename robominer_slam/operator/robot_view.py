@@ -50,6 +50,7 @@ class RobotView:
         status: the newest entries.
         layout: of the array; None while it is not known.
         map: the map.
+        map_since_ns: stamp of the newest frame when another map began; 0 in the first.
         traffic: messages, bytes, outages.
         history: of the session.
         events: log of what happened, the newest last.
@@ -68,6 +69,7 @@ class RobotView:
         self.layout: WhiskerLayout | None = None
         self.layout_sequence = 0
         self.map = MapModel()
+        self.map_since_ns = 0
         self.traffic = Traffic()
         self.history = history or SessionHistory()
         self.events: deque[SessionEvent] = deque(maxlen=KEPT_EVENTS)
@@ -140,6 +142,8 @@ class RobotView:
         with self.lock:
             if self.map.map_id not in (0, state.map_id):
                 self.note(f"another map begins: {state.map_id:016x}")
+                # Places of before mean nothing in it.
+                self.map_since_ns = 0 if self.live is None else self.live.stamp_ns
             self.map.update(state)
 
     def take_closures(self, pairs: list[tuple[int, int]]) -> None:

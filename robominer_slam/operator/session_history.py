@@ -81,9 +81,15 @@ class SessionHistory:
         """Stamps (UNIX ns) and poses (7,) of all frames kept."""
         return [(int(self._stamp[k]), self._pose[k].copy()) for k in range(self._count)]
 
-    def trail(self, points: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-        """Places driven through, evenly thinned: time (s after the first frame), x, y, z; shape (m, 4), m <= points."""
-        kept = np.unique(np.linspace(0, self._count - 1, min(points, self._count)).astype(np.intp))
+    def trail(self, points: int, since_ns: int = 0) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+        """Places driven through, evenly thinned: time (s after the first frame), x, y, z; shape (m, 4), m <= points.
+
+        Args:
+            points: how many at most.
+            since_ns: only those from this time on.
+        """
+        first = int(np.searchsorted(self._stamp[: self._count], since_ns))
+        kept = np.unique(np.linspace(first, self._count - 1, min(points, self._count - first)).astype(np.intp))
         seconds = (self._stamp[kept] - self._stamp[0]) * 1e-9
         return np.column_stack([seconds, self._pose[kept, :3]])
 

@@ -159,7 +159,7 @@ class PageStream:
 
     async def _trail(self) -> None:
         with self._view.lock:
-            trail = self._view.history.trail(TRAIL_POINTS)
+            trail = self._view.history.trail(TRAIL_POINTS, self._view.map_since_ns)
         await self._json("trail", points=np.round(trail, 3).ravel().tolist())
 
     def _steady(self, heights: tuple[float, float]) -> tuple[float, float]:

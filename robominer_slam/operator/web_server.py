@@ -7,6 +7,7 @@ import contextlib
 import json
 import logging
 import math
+import re
 import socket
 import threading
 import webbrowser
@@ -67,23 +68,24 @@ def application(session: Session, token: str | None) -> FastAPI:
     async def stream(page: WebSocket) -> None:
         await page.accept()
         follower = PageStream(session.view, page, meter)
-        sending = asyncio.create_task(follower.run())
+        tasks = [asyncio.create_task(follower.run()), asyncio.create_task(_receive(page, follower))]
         try:
-            while not sending.done():
-                stamp = json.loads(await page.receive_text())["seek"]
-                follower.seek_ns = int(stamp * 1_000_000) if _is_stamp(stamp) else None
-        except (WebSocketDisconnect, ValueError, KeyError, TypeError) as error:
-            log.debug("a page has gone: %s", error)
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            sending.cancel()
-            with contextlib.suppress(asyncio.CancelledError, WebSocketDisconnect, RuntimeError):
-                await sending
+            for task in tasks:
+                task.cancel()
+            ended = await asyncio.gather(*tasks, return_exceptions=True)
+        for error in ended:
+            # A page that goes away ends with one of these; the page asks anew after anything else.
+            if isinstance(error, Exception) and not isinstance(error, (WebSocketDisconnect, RuntimeError)):
+                log.error("a page's stream has failed", exc_info=error)
 
     @app.get("/export/{name}")
     def export(name: str) -> Response:
         if name not in _EXPORTS:
             return Response(f"expected one of {', '.join(_EXPORTS)}\n", status_code=404, media_type="text/plain")
-        headers = {"Content-Disposition": f'attachment; filename="{session.robot}-{name}"'}
+        robot = re.sub(r"[^A-Za-z0-9_.-]", "_", session.robot)
+        headers = {"Content-Disposition": f'attachment; filename="{robot}-{name}"'}
         return Response(_EXPORTS[name](session.view), media_type="application/octet-stream", headers=headers)
 
     ui.page("/")(lambda: build_page(session))
@@ -143,6 +145,17 @@ def serve(
 
     threading.Thread(target=tell_when_ready, name="operator-ready", daemon=True).start()
     server.run(sockets=[listener])
+
+
+async def _receive(page: WebSocket, follower: PageStream) -> None:
+    """Take which moment the page looks at, until it goes away or sends what is no such message."""
+    while True:
+        try:
+            stamp = json.loads(await page.receive_text())["seek"]
+        except (ValueError, KeyError, TypeError) as error:
+            log.warning("a page sent what is no moment: %s", error)
+            return
+        follower.seek_ns = int(stamp * 1_000_000) if _is_stamp(stamp) else None
 
 
 def _is_stamp(value: object) -> bool:

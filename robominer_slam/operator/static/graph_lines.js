@@ -51,6 +51,13 @@ export class GraphLines {
     this.show(this.shown ?? slots);
   }
 
+  /** Another map begins. */
+  clear() {
+    this.count = 0;
+    this.setPairs([], new Float32Array(0));
+    this.setTrail([]);
+  }
+
   setPairs(pairs, poses) {
     this.pairs = pairs;
     this.lastPaired = pairs.reduce((most, slot) => Math.max(most, slot + 1), 0);

@@ -119,14 +119,17 @@ export default {
         robot.update(live);
         tools.robotZ = live.pose[2];
         rig.robotAt(...live.pose.slice(0, 3));
-        const slots = live.past ? live.slots : 1e9;
+        const slots = live.past ? live.slots : 1 << 30;
         cloud.material.uniforms.slotsShown.value = slots;
         lines.show(slots);
         lines.showTrail(live.past ? (live.stamp - live.span[0]) / 1000 : Infinity);
         this.own.stamp = live.past ? null : live.stamp;
       }));
       stream.on("map", scene((message) => {
-        if (message.reset) cloud.clear();
+        if (message.reset) {
+          cloud.clear();
+          lines.clear();
+        }
         cloud.takeBounds(message.bounds, message.heights);
         this.own.slots = message.slots;
         this.own.low = message.heights[0] - 0.02;

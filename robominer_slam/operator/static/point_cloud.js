@@ -56,7 +56,7 @@ export class PointCloud {
         poses: { value: null },
         colours: { value: null },
         firstSlot: { value: 0 },
-        slotsShown: { value: 0 },
+        slotsShown: { value: 1 << 30 },
         heights: { value: new THREE.Vector2(0, 1) },
         size: { value: 0.012 },
         pixels: { value: 1000 },
