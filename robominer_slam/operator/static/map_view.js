@@ -6,6 +6,8 @@ import { sceneColours } from "robominer-console/colours.js";
 /** Between being asked for a drawing and drawing: above the first the graphics are overloaded, below the second not. */
 const LATE_MS = 60;
 const EARLY_MS = 25;
+/** The picture rests when nothing was drawn for so long. */
+const REST_MS = 300;
 /** So many points are always drawn. */
 const LEAST_POINTS = 60000;
 const LAYERS = { points: "Points", path: "Path", keyframes: "Keyframes", closures: "Loop closures", trail: "Way driven", robot: "Robot" };
@@ -145,7 +147,7 @@ export default {
       }));
       stream.on("points", scene(({ chunk, points }) => {
         cloud.takePoints(chunk, points);
-        cloud.setDetail(this.own.detail);
+        cloud.setDetail(this.own.share ?? 1);
       }));
       stream.on("closures", scene(({ pairs }) => lines.setPairs(pairs, cloud.poses)));
       stream.on("trail", scene(({ points }) => lines.setTrail(points)));
@@ -182,23 +184,31 @@ export default {
       if (own.stamp) stats.latency = Date.now() - own.stamp;
       own.stamp = null;
     },
-    /** Fewer points where the graphics cannot follow; all of them again once the picture rests. */
+    /** Fewer points where the graphics cannot follow; all of them once the picture rests. */
     adapt(waited) {
       const own = this.own;
-      const before = own.detail;
-      if (waited > LATE_MS) own.detail = Math.max(Math.min(1, LEAST_POINTS / (own.points || 1)), 0.7 * before);
-      else if (waited < EARLY_MS) own.detail = Math.min(1, 1.08 * before);
-      stream.stats.detail = own.detail;
-      if (own.detail === before) return;
-      own.cloud.setDetail(own.detail);
-      this.tellCount();
+      if (!own.resting) {
+        if (waited > LATE_MS) own.detail = Math.max(Math.min(1, LEAST_POINTS / (own.points || 1)), 0.7 * own.detail);
+        else if (waited < EARLY_MS) own.detail = Math.min(1, 1.08 * own.detail);
+      }
+      const share = own.resting ? 1 : own.detail;
+      own.resting = false;
       clearTimeout(own.rest);
-      if (own.detail < 1) own.rest = setTimeout(() => this.render(), 150);
+      if (share < 1) {
+        own.rest = setTimeout(() => {
+          own.resting = true;
+          this.render();
+        }, REST_MS);
+      }
+      if (share === own.share) return;
+      own.share = stream.stats.detail = share;
+      own.cloud.setDetail(share);
+      this.tellCount();
     },
     tellCount() {
-      const { points = 0, detail } = this.own;
-      const share = detail < 1 ? `, ${Math.round(100 * detail)} % drawn` : "";
-      const text = `${points.toLocaleString("en")} points${share}`;
+      const { points = 0, share = 1 } = this.own;
+      const drawn = share < 1 ? `, ${Math.round(100 * share)} % drawn` : "";
+      const text = `${points.toLocaleString("en")} points${drawn}`;
       if (this.$refs.count.textContent !== text) this.$refs.count.textContent = text;
     },
     resize() {

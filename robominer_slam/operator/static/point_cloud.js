@@ -6,6 +6,9 @@ import { colourBytes } from "./colours.js";
 
 /** Keyframes to a chunk, as in `map_model.py`. */
 const CHUNK = 128;
+/** Of whiskers, from the robot's middle, m. */
+const REACH = 0.4;
+
 const VERTEX = `
 precision highp float;
 precision highp int;
@@ -149,11 +152,14 @@ export class PointCloud {
     }
   }
 
-  /** Box around everything that is drawn. */
+  /** Box around all keyframes and what the whiskers reach from them. */
   box() {
     const box = new THREE.Box3();
-    for (const sphere of this.spheres ?? []) if (sphere.radius > 0) box.union(sphere.getBoundingBox(new THREE.Box3()));
-    return box;
+    const place = new THREE.Vector3();
+    for (let k = 0; k < this.poses.length; k += 8) {
+      if (this.poses[k + 3] > 0.5) box.expandByPoint(place.fromArray(this.poses, k));
+    }
+    return box.isEmpty() ? box : box.expandByVector(new THREE.Vector3(REACH, REACH, 0));
   }
 
   /** The point nearest to a ray, within a cone of `slope` m per m and `radius` m; null if there is none. */

@@ -10,12 +10,12 @@ export default {
   template: `
     <div class="whisker-panel follows-link" data-testid="whiskers">
       <svg :viewBox="box" role="group" aria-label="Whiskers from above, front up">
-        <text class="front" :x="frontX" :y="frontY">front</text>
+        <text class="front" :x="frontX" :y="frontY" :style="{fontSize: frontSize + 'px'}">front</text>
         <g v-for="w in whiskers" :key="w.index" class="whisker" :class="{chosen: w.index===chosen}" :transform="w.place" tabindex="0" role="button"
            :data-whisker="w.index" :aria-label="w.label" @click="choose(w.index)" @keydown.enter="choose(w.index)">
           <circle :r="radius" class="socket"/>
           <line x1="0" y1="0" x2="0" y2="0" class="bend"/>
-          <text class="fault" dy="0.36em"></text>
+          <text class="fault" dy="0.36em" :style="{fontSize: radius + 'px'}"></text>
           <title>{{ w.label }}</title>
         </g>
       </svg>
@@ -23,7 +23,7 @@ export default {
       <div class="whisker-detail" aria-live="polite" data-testid="whisker-detail">{{ detail }}</div>
     </div>`,
   data() {
-    return { whiskers: [], box: "0 0 1 1", radius: 14, chosen: null, detail: "Click a whisker for its history", frontX: 0, frontY: 0 };
+    return { whiskers: [], box: "0 0 1 1", radius: 14, chosen: null, detail: "Click a whisker for its history", frontX: 0, frontY: 0, frontSize: 22 };
   },
   mounted() {
     this.marks = [];
@@ -47,9 +47,11 @@ export default {
       for (const [x, y, k] of seen) for (const [u, v, m] of seen) if (m < k) gap = Math.min(gap, Math.hypot(x - u, y - v));
       this.radius = 0.42 * Math.min(gap, 80);
       const rim = 2.2 * this.radius;
-      const [left, top] = [Math.min(...xs) - rim, Math.min(...ys) - rim - 18];
-      this.box = `${left} ${top} ${Math.max(...xs) + rim - left} ${Math.max(...ys) + rim - top}`;
-      [this.frontX, this.frontY] = [(Math.min(...xs) + Math.max(...xs)) / 2, top + 18];
+      const width = Math.max(...xs) - Math.min(...xs) + 2 * rim;
+      this.frontSize = width / 24;
+      const [left, top] = [Math.min(...xs) - rim, Math.min(...ys) - rim - this.frontSize];
+      this.box = `${left} ${top} ${width} ${Math.max(...ys) + rim - top}`;
+      [this.frontX, this.frontY] = [(Math.min(...xs) + Math.max(...xs)) / 2, top + this.frontSize];
       this.whiskers = seen.map(([x, y, k]) => ({
         index: k, place: `translate(${x.toFixed(1)} ${y.toFixed(1)})`, label: `whisker, row ${Math.floor(k / array.cols)}, column ${k % array.cols}`,
       }));
