@@ -121,7 +121,8 @@ class PublishedRobot:
 
     def _snapshot(self) -> list[Reply]:
         with self.lock:
-            return [Reply(payload) for payload in self._encoder.snapshot_payloads()]
+            messages = self._encoder.snapshot()
+        return [Reply(b"".join(messages[k : k + 100])) for k in range(0, len(messages), 100)]
 
     def _graph(self) -> bytes:
         with self.lock:

@@ -6,6 +6,7 @@ import contextlib
 import importlib.util
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -19,6 +20,11 @@ Example: robominer-slam operator --connect tcp/127.0.0.1:7447
 Example of a recording: robominer-slam operator --recording drive.mcap"""
 )
 @click.option("--connect", default="tcp/127.0.0.1:7447", show_default=True, help="Endpoint of the daemon.")
+@click.option(
+    "--credentials",
+    type=click.Path(file_okay=False, path_type=Path),
+    help="Folder with your bundle from `keys issue`, for tls/ endpoints.",
+)
 @click.option("--robot", default="rm3", show_default=True, help="The robot's id.")
 @click.option("--timeout", default=5.0, show_default=True, help="How long to wait for the daemon at first, s.")
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to serve the page on.")
@@ -40,6 +46,7 @@ Example of a recording: robominer-slam operator --recording drive.mcap"""
 )
 def operator(
     connect: str,
+    credentials: Path | None,
     robot: str,
     timeout: float,
     host: str,
@@ -56,7 +63,7 @@ def operator(
     from robominer_slam.operator.link import MAX_MESSAGE_BYTES, RobotLink
     from robominer_slam.operator.recording_source import RecordingSource
     from robominer_slam.operator.web_server import ServerError, listening_socket, serve
-    from robominer_slam.publishing.zenoh_session import ZenohSettings
+    from robominer_slam.publishing.client_settings import client_settings
 
     if not is_loopback(host) and not token:
         raise ConfigurationError(f"--host {host}: others could reach the robot there; give --token SECRET as well")
@@ -70,9 +77,7 @@ def operator(
         if recording is not None:
             session = stack.enter_context(RecordingSource(recording, config_file))
         else:
-            settings = ZenohSettings(
-                connect=(connect,), mode="client", connect_timeout_s=timeout, max_message_bytes=MAX_MESSAGE_BYTES
-            )
+            settings = replace(client_settings(connect, credentials, timeout), max_message_bytes=MAX_MESSAGE_BYTES)
             session = stack.enter_context(RobotLink(settings, robot))
         if browse is None:
             browse = sys.stdout.isatty() and bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

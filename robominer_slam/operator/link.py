@@ -202,7 +202,9 @@ class RobotLink:
             self.view.take_layout(layout)
 
     def _ask_snapshot(self) -> None:
-        for reply in self._bus.get("map/snapshot", timeout_s=QUERY_TIMEOUT_S):
+        with self._decoder_lock:
+            copy = {name: str(value) for name, value in self._decoder.copy.items()}
+        for reply in self._bus.get("map/snapshot", copy, timeout_s=QUERY_TIMEOUT_S):
             self._feed(reply.payload)
 
     def _graph_wanted(self, closures: int) -> bool:

@@ -92,7 +92,7 @@ class MapModel:
             self.closures, self.closures_revision = closures, self.revision
 
     def chunk(self, index: int) -> NDArray[np.int16]:
-        """Points of a chunk, shape (m, 4): x y z (mm, in the keyframe's frame) and the slot within the chunk.
+        """Points of a chunk, shape (m, 4): x y z (POINT_UNIT_M, in the keyframe's frame), slot in the chunk.
 
         In an order that makes any first part of them a fair sample of the whole.
         """

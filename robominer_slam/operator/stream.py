@@ -20,6 +20,7 @@ import numpy as np
 from robominer_slam.operator.live_frame import LiveFrame
 from robominer_slam.operator.readings import ProcessorMeter, place_fields, readings
 from robominer_slam.operator.robot_view import RobotView
+from robominer_slam.publishing.map_state import POINT_UNIT_M
 
 #: The least time between two turns: twice as often as the fastest array is read, s.
 TURN_S = 0.02
@@ -140,7 +141,15 @@ class PageStream:
             if model.closures_revision > self._closures_revision:
                 self._closures_revision, closures = model.closures_revision, model.closures.ravel().tolist()
             count, points = model.count, model.points
-        await self._json("map", reset=reset, slots=count, points=points, bounds=bounds, heights=self._steady(heights))
+        await self._json(
+            "map",
+            reset=reset,
+            slots=count,
+            points=points,
+            unit=POINT_UNIT_M,
+            bounds=bounds,
+            heights=self._steady(heights),
+        )
         if last > first:
             await self._socket.send_bytes(_HEAD.pack(POSES, first, last - first) + poses)
         if closures is not None:

@@ -132,6 +132,7 @@ export default {
           cloud.clear();
           lines.clear();
         }
+        cloud.material.uniforms.unit.value = message.unit;
         cloud.takeBounds(message.bounds, message.heights);
         this.own.slots = message.slots;
         this.own.low = message.heights[0] - 0.02;

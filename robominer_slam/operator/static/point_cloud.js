@@ -16,14 +16,14 @@ precision highp sampler2D;
 uniform mat4 modelViewMatrix, projectionMatrix;
 uniform sampler2D poses;
 uniform int firstSlot, slotsShown;
-uniform float size, pixels;
+uniform float size, pixels, unit;
 in vec4 position;
 out float height;
 void main() {
   int slot = int(position.w);
   vec4 place = texelFetch(poses, ivec2(2 * slot, 0), 0);
   vec4 q = texelFetch(poses, ivec2(2 * slot + 1, 0), 0);
-  vec3 v = 0.001 * position.xyz;
+  vec3 v = unit * position.xyz;
   vec3 point = v + 2.0 * cross(q.xyz, cross(q.xyz, v) + q.w * v) + place.xyz;
   height = point.z;
   vec4 seen = projectionMatrix * (modelViewMatrix * vec4(point, 1.0));
@@ -61,7 +61,8 @@ export class PointCloud {
         firstSlot: { value: 0 },
         slotsShown: { value: 1 << 30 },
         heights: { value: new THREE.Vector2(0, 1) },
-        size: { value: 0.012 },
+        size: { value: 0.022 },
+        unit: { value: 0.005 },
         pixels: { value: 1000 },
         faded: { value: 0 },
       },
@@ -169,6 +170,7 @@ export class PointCloud {
     const q = new THREE.Quaternion();
     const place = new THREE.Vector3();
     const shown = this.material.uniforms.slotsShown.value;
+    const unit = this.material.uniforms.unit.value;
     this.chunks.forEach((object, index) => {
       if (!object || !ray.intersectsSphere(object.geometry.boundingSphere)) return;
       const points = object.geometry.attributes.position.array;
@@ -177,7 +179,7 @@ export class PointCloud {
         const p = 8 * slot;
         if (slot >= shown || this.poses[p + 3] < 0.5) continue;
         q.fromArray(this.poses, p + 4);
-        v.set(points[k], points[k + 1], points[k + 2]).multiplyScalar(0.001).applyQuaternion(q).add(place.fromArray(this.poses, p));
+        v.set(points[k], points[k + 1], points[k + 2]).multiplyScalar(unit).applyQuaternion(q).add(place.fromArray(this.poses, p));
         const along = v.clone().sub(ray.origin).dot(ray.direction);
         const miss = Math.sqrt(ray.distanceSqToPoint(v));
         const reach = radius + slope * along;
