@@ -61,8 +61,15 @@ class PublishedRobot:
     """
 
     def __init__(
-        self, endpoint: str, *, remote: bool = False, points: int = 60, keyframe_m: float = KEYFRAME_M
+        self,
+        endpoint: str,
+        *,
+        remote: bool = False,
+        points: int = 60,
+        keyframe_m: float = KEYFRAME_M,
+        settings: ZenohSettings | None = None,
     ) -> None:
+        self._settings = settings or ZenohSettings(listen=(endpoint,))
         self.endpoint, self._remote, self._points, self._keyframe_m = endpoint, remote, points, keyframe_m
         self.bend: dict[int, float] = dict.fromkeys(range(16, 24), math.radians(20.0))
         self.faults: dict[int, str] = {}
@@ -94,7 +101,7 @@ class PublishedRobot:
 
     def start(self) -> None:
         self._stop.clear()
-        self._bus = ZenohBus(ZenohSettings(listen=(self.endpoint,)), "robominer/rm3")
+        self._bus = ZenohBus(self._settings, "robominer/rm3")
         mounts = geometry.from_rotation_translation(self.layout.R_base_whisker, self.layout.p_base)
         names = [f"whisker_{i // self.layout.cols}_{i % self.layout.cols}" for i in range(self.layout.count)]
         transforms = [

@@ -12,10 +12,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, expect
+from playwright.sync_api import Browser, Locator, Page, expect
 
+from robominer_slam.configuration.model import ZenohSection
 from robominer_slam.publishing.bus_messages import QueryError
+from robominer_slam.publishing.robot_settings import robot_settings
 from robominer_slam.publishing.zenoh_session import ZenohBus, ZenohSettings
+from robominer_slam.security.authority import Authority
 from tests.operator_page import PATIENCE_MS, browser, console, free_port, opened, program, status_of
 from tests.published_robot import PublishedRobot
 
@@ -28,21 +31,43 @@ def chromium() -> Iterator[Browser]:
         yield started
 
 
-def test_telemetry_alone_is_enough_and_a_viewer_may_not_command(chromium: Browser, tmp_path: Path):
-    robot = PublishedRobot(f"tcp/127.0.0.1:{free_port()}", remote=True)
-    robot.obeys = False
-    with robot, console(tmp_path / "log", "--connect", robot.endpoint) as address:
-        page = opened(chromium, address)
+def pressed(page: Page, button: str) -> Locator:
+    """Press a command's button and confirm; where its result is told."""
+    page.get_by_test_id(button).click()
+    page.get_by_test_id("ask").get_by_test_id("confirm").click()
+    return page.get_by_test_id("command-result").first
+
+
+def test_by_tls_a_viewer_sees_all_and_may_not_command(chromium: Browser, tmp_path: Path):
+    authority, port = Authority.create(tmp_path / "keys"), free_port()
+    for name, role in (("rm3", "robot"), ("alice", "operator"), ("bob", "viewer")):
+        authority.issue(name, role)
+    section = ZenohSection(credentials=str(authority.bundle("rm3")), listen=(f"tls/127.0.0.1:{port}",))
+    settings = robot_settings(section, tmp_path, "robominer/rm3")
+    robot = PublishedRobot(f"tls/localhost:{port}", settings=settings)
+
+    def options(name: str) -> tuple[str, ...]:
+        return "--connect", robot.endpoint, "--timeout", "15", "--credentials", str(authority.bundle(name))
+
+    with (
+        robot,
+        console(tmp_path / "bob", *options("bob")) as viewers,
+        console(tmp_path / "alice", *options("alice")) as operators,
+    ):
+        page = opened(chromium, viewers)
+        # Telemetry and the map's changes alone come by this link.
         expect(page.locator("body")).to_have_attribute("data-link", "live", timeout=PATIENCE_MS)
         expect(page.locator("[data-whisker='17']")).to_have_attribute("data-state", "touch")
         page.wait_for_function("parseInt(document.querySelector('.map-count').textContent) > 0")
         expect(page.get_by_test_id("waypoint")).to_be_hidden()
-        page.get_by_test_id("cmd-rezero").click()
-        page.get_by_test_id("ask").get_by_test_id("confirm").click()
-        result = page.get_by_test_id("command-result").first
-        expect(result).to_have_attribute("data-outcome", "unanswered")
+        result = pressed(page, "cmd-rezero")
+        expect(result).to_have_attribute("data-outcome", "unanswered", timeout=PATIENCE_MS)
         expect(result).to_contain_text("not answered")
         expect(result).to_contain_text("may look on but not command")
+        assert robot.commands == []
+        page.goto(operators)
+        expect(page.locator("body")).to_have_attribute("data-link", "live", timeout=PATIENCE_MS)
+        expect(pressed(page, "cmd-rezero")).to_have_attribute("data-outcome", "done", timeout=PATIENCE_MS)
         assert page.complaints == []  # type: ignore[attr-defined]
         page.close()
 
