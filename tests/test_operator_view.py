@@ -115,6 +115,7 @@ def test_a_corrected_graph_moves_points_without_sending_them_again():
     assert model.chunk_revision[0] == points
     assert model.pose_revision[1] == model.revision > model.pose_revision[0]
     assert np.allclose(model.poses[1, :4], [2.0, 0.0, 0.0, 1.0])
+    assert model.spacing() == pytest.approx(0.03)
     low, high = model.height_range()
     assert -0.21 < low < high < -0.09
 

@@ -6,6 +6,8 @@ the page moves them with their keyframe's pose, so that a correction costs 32 by
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,6 +20,10 @@ FloatArray = NDArray[np.float64]
 CHUNK = 128
 #: Of the heights, which the colours run from and to: single wrong touches must not bleach the map.
 HEIGHT_PERCENTILES = (1.0, 99.0)
+#: Points are drawn as large as the ground between them: the map stream tells one of each cell of this size, m.
+_CELL = 0.03
+#: Dense maps are drawn with points of no less than this share of it.
+_FINEST = 3.0
 #: Points of each keyframe that stand for all of it in the range of heights.
 _SAMPLED = 4
 
@@ -52,6 +58,7 @@ class MapModel:
         self._keyframes: list[StreamKeyframe | None] = []
         self._stamps = np.zeros(CHUNK, dtype=np.int64)
         self._sample = np.full((CHUNK, _SAMPLED, 3), np.nan, dtype=np.float32)
+        self._cells = np.zeros(CHUNK, dtype=np.int64)
         self._reach: list[float] = []
         self._generator = np.random.default_rng(0)
 
@@ -130,6 +137,12 @@ class MapModel:
         low, high = (float(value) for value in np.percentile(heights, HEIGHT_PERCENTILES))
         return low, max(high, low + 0.02)
 
+    def spacing(self) -> float:
+        """How far neighbouring points are from each other, as far as it is to be drawn, m."""
+        cells = int(self._cells[: self.count].sum())
+        to_a_cell = max(self.points / cells, 1.0) if cells else 1.0
+        return _CELL / min(math.sqrt(to_a_cell), _FINEST)
+
     def cloud(self) -> FloatArray:
         """All points in map, shape (m, 3), m."""
         parts = [
@@ -156,6 +169,7 @@ class MapModel:
             self.poses = np.concatenate([self.poses, np.zeros_like(self.poses)])
             self.pose_revision = np.concatenate([self.pose_revision, np.zeros_like(self.pose_revision)])
             self._stamps = np.concatenate([self._stamps, np.zeros_like(self._stamps)])
+            self._cells = np.concatenate([self._cells, np.zeros_like(self._cells)])
             self._sample = np.concatenate([self._sample, np.full_like(self._sample, np.nan)])
         if slot // CHUNK >= len(self.chunk_revision):
             self.chunk_revision.append(self.revision)
@@ -165,11 +179,12 @@ class MapModel:
     def _set_points(self, slot: int, keyframe: StreamKeyframe | None) -> None:
         known = self._keyframes[slot]
         self.points += (0 if keyframe is None else len(keyframe.points)) - (0 if known is None else len(known.points))
-        self._sample[slot] = np.nan
+        self._sample[slot], self._cells[slot] = np.nan, 0
         if keyframe is None:
             self._keyframes[slot] = None
         elif len(keyframe.points):
             points = keyframe.points_m()
+            self._cells[slot] = len(np.unique(np.floor(points[:, :2] / _CELL) @ [1.0, 1e5]))
             chosen = points[np.linspace(0, len(points) - 1, min(_SAMPLED, len(points))).astype(np.intp)]
             self._sample[slot, : len(chosen)] = chosen
             reach = float(np.sqrt(np.square(points).sum(axis=1).max()))

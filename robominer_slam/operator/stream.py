@@ -140,13 +140,14 @@ class PageStream:
             closures = None
             if model.closures_revision > self._closures_revision:
                 self._closures_revision, closures = model.closures_revision, model.closures.ravel().tolist()
-            count, points = model.count, model.points
+            count, points, spacing = model.count, model.points, round(model.spacing(), 4)
         await self._json(
             "map",
             reset=reset,
             slots=count,
             points=points,
             unit=POINT_UNIT_M,
+            spacing=spacing,
             bounds=bounds,
             heights=self._steady(heights),
         )

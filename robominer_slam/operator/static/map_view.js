@@ -133,6 +133,7 @@ export default {
           lines.clear();
         }
         cloud.material.uniforms.unit.value = message.unit;
+        cloud.material.uniforms.size.value = 1.15 * message.spacing;
         cloud.takeBounds(message.bounds, message.heights);
         this.own.slots = message.slots;
         this.own.low = message.heights[0] - 0.02;

@@ -30,7 +30,7 @@ void main() {
   bool shown = firstSlot + slot < slotsShown && place.w > 0.5;
   gl_Position = shown ? seen : vec4(2.0, 2.0, 2.0, 1.0);
   // As large as they are in the world, but never too small to be seen.
-  gl_PointSize = clamp(size * pixels / seen.w, 2.0, 12.0);
+  gl_PointSize = clamp(size * pixels / seen.w, 2.0, 32.0);
 }`;
 
 const FRAGMENT = `
