@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import resource
+import shutil
 from collections.abc import Sequence
 
 import numpy as np
@@ -100,6 +101,10 @@ def whiskers_diagnostic(frame: FrameResult, layout: WhiskerLayout, pipeline: Pip
 def store_diagnostic(store: MapStore) -> Diagnostic:
     """The database."""
     values = {"written": str(store.written), "dropped": str(store.dropped), "map_id": str(store.map_id)}
+    try:
+        values["disk.free_MB"] = str(shutil.disk_usage(store.folder).free // 1_000_000)
+    except OSError as error:
+        values["disk.fault"] = str(error)
     if store.fault:
         return Diagnostic("store", Level.ERROR, f"not stored: {store.fault}", values)
     return Diagnostic("store", Level.OK, f"{store.written} keyframes stored", values)

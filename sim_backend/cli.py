@@ -89,6 +89,9 @@ A recording instead, as fast as it goes; the same with another odometry; and ser
 @click.option("--method", default=None, help="SLAM method in the configuration (default: the daemon's).")
 @click.option("--listen", default="tcp/127.0.0.1:7447", show_default=True, help="Zenoh endpoint in the configuration.")
 @click.option(
+    "--zenoh-waypoints", is_flag=True, help="Also take waypoints over Zenoh, from an operator's console at --listen."
+)
+@click.option(
     "--protocol",
     "protocols",
     multiple=True,
@@ -129,6 +132,7 @@ def simulate(
     source: str,
     method: str | None,
     listen: str,
+    zenoh_waypoints: bool,
     protocols: tuple[str, ...],
     faults: str | None,
     max_time: float | None,
@@ -173,6 +177,7 @@ def simulate(
         source=source,
         method=method,
         listen=listen,
+        zenoh_waypoints=zenoh_waypoints,
         protocols=protocols,
         faults=faults,
         whisker_truth=not no_whisker_truth,

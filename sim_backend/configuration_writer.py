@@ -17,6 +17,7 @@ from sim_backend.jig import jig_sweep, to_csv
 CONFIGURATION, CALIBRATION, JIG_TABLE = "config.toml", "calibration.json", "jig.csv"
 BAUD = 115200
 #: A calibration of a simulated array was made on the day its recordings begin.
+ROBOT_ID = "rm3"
 CALIBRATION_DATE = "2021-06-01"
 
 
@@ -43,7 +44,7 @@ def configuration_text(
     method: str | None,
     store: Path,
     listen: str,
-    robot_id: str = "rm3",
+    robot_id: str = ROBOT_ID,
 ) -> str:
     """A configuration for the daemon (interfaces, section 5).
 

@@ -1,4 +1,4 @@
-"""simulate + run + a listener, each a process of its own; then the report.
+"""simulate + run + a listener + the operator's console, each a process of its own; then the report.
 
 All figures come from what went over Zenoh, from /proc, and from the simulator's truth.
 """
@@ -6,7 +6,9 @@ All figures come from what went over Zenoh, from /proc, and from the simulator's
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -24,6 +26,8 @@ from sim_backend.demo_report import write_report
 from sim_backend.live_view import LiveView
 from sim_backend.process_usage import ProcessUsage, usage_of
 
+#: What the operator's console says when its page can be opened.
+PAGE = "operator's console:"
 STARTUP_TIMEOUT_S = 60.0
 ENDING_TIMEOUT_S = 30.0
 REFRESH_S = 0.5
@@ -42,6 +46,7 @@ class DemoSettings:
     max_time: float | None
     record: bool
     as_json: bool
+    operator_port: int | None = None
 
 
 class DemoError(click.ClickException):
@@ -121,7 +126,7 @@ def simulate_arguments(settings: DemoSettings, robot: Path, endpoint: str) -> li
     """The simulator's command line."""
     arguments = ["simulate", "--world", "thesis", "--scenario", str(settings.scenario), "--engine", "physics"]
     arguments += ["--seed", str(settings.seed), "--method", settings.method]
-    arguments += ["--out", str(robot), "--listen", endpoint, "--json"]
+    arguments += ["--out", str(robot), "--listen", endpoint, "--zenoh-waypoints", "--json"]
     if settings.max_time is not None:
         arguments += ["--max-time", str(settings.max_time)]
     return arguments
@@ -140,6 +145,7 @@ def run_demo(settings: DemoSettings) -> None:
     (robot / "map.db").unlink(missing_ok=True)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     console = Console(stderr=True)
+    operator: Child | None = None
     with contextlib.ExitStack() as stack:
         console.print("simulated robot: physics, magnets, sensors ...", highlight=False)
         simulate = program(*simulate_arguments(settings, robot, endpoint))
@@ -151,9 +157,17 @@ def run_demo(settings: DemoSettings) -> None:
         # The listener keeps trying until the daemon listens; the robot drives off when the daemon reads its ports.
         listener = stack.enter_context(started("listener", listening, out / "listener.log"))
         daemon = stack.enter_context(started("run", run, out / "run.log"))
+        if settings.operator_port is not None:
+            operator = stack.enter_context(operator_console(settings.operator_port, endpoint, out, console))
         listener.wait_until(lambda: "listening" in listener.log.read_text(encoding="utf-8"), "the daemon on Zenoh")
+        if operator is not None:
+            operator.wait_until(lambda: PAGE in operator.log.read_text(encoding="utf-8"), "the operator's page")
+            line = next(s for s in operator.log.read_text(encoding="utf-8").splitlines() if PAGE in s)
+            console.print(line, highlight=False, soft_wrap=True)
         usage = _watch(settings, console, Path(ready["truth"]), float(ready["duration"]), simulator, daemon)
         listener.end()
+        if operator is not None:
+            operator.end()
         daemon.end()
     write_report(out, Path(ready["truth"]), settings.scenario, usage, settings.as_json)
     if settings.record:
@@ -161,6 +175,30 @@ def run_demo(settings: DemoSettings) -> None:
         recording = simulate_arguments(settings, robot, endpoint)
         subprocess.run(program(*recording, "--record", str(out / "drive.mcap")), check=True, stdout=subprocess.DEVNULL)
     console.print(f"{time.monotonic() - begin:.0f} s; figures and trajectories are in {out}/", highlight=False)
+
+
+def operator_console(
+    port: int, endpoint: str, out: Path, console: Console
+) -> contextlib.AbstractContextManager[Child | None]:
+    """The operator's console as a process; None, and a word about it, where its libraries are not installed."""
+    if importlib.util.find_spec("nicegui") is None:
+        console.print("no operator's console: pip install 'robominer-slam[operator]'", highlight=False)
+        return contextlib.nullcontext()
+    # A browser comes up only for someone who sits here.
+    display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    browse = "--open" if console.is_terminal and display else "--no-open"
+    arguments = ["operator", "--connect", endpoint, "--timeout", str(STARTUP_TIMEOUT_S), browse]
+    arguments += ["--port", str(port if port_is_free(port) else 0)]
+    return started("operator", program(*arguments), out / "operator.log")
+
+
+def port_is_free(port: int) -> bool:
+    """Whether a TCP port of loopback can be listened on now."""
+    try:
+        with socket.create_server(("127.0.0.1", port)):
+            return True
+    except OSError:
+        return False
 
 
 def _watch(

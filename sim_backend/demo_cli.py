@@ -15,14 +15,28 @@ import click
 @click.option("--method", type=click.Choice(["robust", "thesis", "none"]), default="robust", show_default=True,
               help="SLAM method; none gives exactly the odometry.")  # fmt: skip
 @click.option("--max-time", type=click.FloatRange(min=5.0), help="Cut the drive short, s.")
+@click.option("--operator-port", type=click.IntRange(0, 65535), default=8080, show_default=True,
+              help="Port of the operator's console; another where it is taken.")  # fmt: skip
+@click.option("--no-operator", is_flag=True, help="Without the operator's console.")
 @click.option("--record", is_flag=True, help="Also write the drive as OUT/drive.mcap, for replay.")
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
-def demo(out: Path, scenario: int, seed: int, method: str, max_time: float | None, record: bool, as_json: bool) -> None:
-    """A simulated robot, the daemon and a listener, each a process; then the report with figures.
+def demo(
+    out: Path,
+    scenario: int,
+    seed: int,
+    method: str,
+    max_time: float | None,
+    operator_port: int,
+    no_operator: bool,
+    record: bool,
+    as_json: bool,
+) -> None:
+    """A simulated robot, the daemon, a listener and the operator's console, each a process; then the report.
 
     Takes as long as the scenario: two and a half minutes for scenario 1.
     """
     from sim_backend.demo import DemoSettings, run_demo  # matplotlib and rich: not for --help
 
     out.mkdir(parents=True, exist_ok=True)
-    run_demo(DemoSettings(out, scenario, seed, method, max_time, record, as_json))
+    port = None if no_operator else operator_port
+    run_demo(DemoSettings(out, scenario, seed, method, max_time, record, as_json, port))

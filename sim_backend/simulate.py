@@ -17,6 +17,7 @@ from robominer_slam.layout import WhiskerLayout
 from sim_backend.configuration_writer import (
     CALIBRATION,
     CONFIGURATION,
+    ROBOT_ID,
     USED_BY_SOURCE,
     Port,
     configuration_text,
@@ -36,6 +37,7 @@ from sim_backend.serial_devices import EVENT_OF_DEVICE, ClockSettings, SerialDev
 from sim_backend.stop_signals import stop_on_signals
 from sim_backend.truth import TruthFile
 from sim_backend.waypoint_control import WaypointControl
+from sim_backend.waypoint_service import WaypointService
 from sim_backend.world import WorldError
 
 TRUTH = "ground_truth.txt"
@@ -57,6 +59,7 @@ class SimulationSettings:
         source: of odometry in the written configuration: `fused` or `odometry`.
         method: of SLAM in the written configuration; None for the daemon's default.
         listen: Zenoh endpoint in the written configuration.
+        zenoh_waypoints: whether the robot also takes waypoints over Zenoh, from that endpoint.
         clocks: clocks of devices that differ from the default.
         protocols: of devices that speak another than `framed`, as `whiskers=rm3-compressed`.
         faults: a file of faults, or `seed:N`; None for a robot without.
@@ -74,6 +77,7 @@ class SimulationSettings:
     source: str = "fused"
     method: str | None = None
     listen: str = "tcp/127.0.0.1:7447"
+    zenoh_waypoints: bool = False
     clocks: dict[str, ClockSettings] | None = None
     protocols: tuple[str, ...] = ()
     faults: str | None = None
@@ -215,6 +219,10 @@ def serve(settings: SimulationSettings, drive: Drive, on_ready: Callable[[ReadyR
         if drive.control is not None:
             control = ControlSocket(out, drive.control.answer)
             at_end.callback(control.close)
+            if settings.zenoh_waypoints:
+                # A scenario ends, also with waypoints after it; who waits for waypoints goes on waiting.
+                service = WaypointService(out, settings.listen, ROBOT_ID, ends=not math.isinf(drive.duration))
+                at_end.enter_context(service)
 
         def write_truth(event: TruthEvent, start: StartTime) -> None:
             truth.write(event, start.unix(event.time_ns))

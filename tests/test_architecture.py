@@ -156,7 +156,44 @@ def test_simulation_only_libraries_stay_in_the_simulator():
             assert not packages_of(imports(path)) & {"mujoco", "magpylib"}, path
 
 
+#: Of the operator's console: what lays out and serves the page, and what is below it.
+PAGE = {
+    "command_panel", "components", "page", "web_server", "whisker_history", "access", "stream",
+}  # fmt: skip
+WEB_MODULES = {"nicegui", "fastapi", "starlette", "uvicorn"}
+
+
+def test_only_the_operators_page_knows_the_web():
+    for package in PACKAGES:
+        for path in files(package):
+            page = path.parent.name == "operator" and path.stem in PAGE
+            assert page or not packages_of(imports(path)) & WEB_MODULES, path
+
+
+def test_the_consoles_page_and_its_link_do_not_know_each_other():
+    for path in files("robominer_slam/operator"):
+        used = {name.split(".")[2] for name in imports(path) if name.startswith("robominer_slam.operator.")}
+        if path.stem in PAGE:
+            assert not used & {"link", "recording_source"}, path
+            assert "zenoh" not in packages_of(imports(path)), path
+        else:
+            assert not used & PAGE, path
+
+
+def test_the_daemon_does_without_the_console():
+    for path in files("robominer_slam"):
+        if path.parent.name != "operator" and path != ROOT / "robominer_slam/cli/operator.py":
+            assert not any(name.startswith("robominer_slam.operator") for name in imports(path)), path
+
+
 def test_development_oracles_are_not_used_by_the_program():
     for package in PACKAGES:
         for path in files(package):
-            assert not packages_of(imports(path)) & {"evo", "gtsam", "hypothesis", "pytest", "mcap_ros2"}, path
+            assert not packages_of(imports(path)) & {
+                "evo",
+                "gtsam",
+                "hypothesis",
+                "pytest",
+                "mcap_ros2",
+                "playwright",
+            }, path

@@ -48,6 +48,7 @@ COMMANDS = {
     "graph": "robominer_slam.cli.graph:graph",
     "keys": "robominer_slam.cli.keys:keys",
     "map": "robominer_slam.cli.map:map_group",
+    "operator": "robominer_slam.cli.operator:operator",
     "replay": "robominer_slam.cli.replay:replay",
     "run": "robominer_slam.cli.run:run",
     "status": "robominer_slam.cli.status:status",
