@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from robominer_slam import geometry
 from robominer_slam.evaluation.trajectory import tum_line
+from robominer_slam.map_files import point_files
 from robominer_slam.operator.robot_view import RobotView
 
 
 def ply(view: RobotView) -> bytes:
     """The map's points, binary little-endian PLY, x y z in m in the map's frame."""
     with view.lock:
-        points = view.map.cloud().astype("<f4")
-    head = (
-        "ply\nformat binary_little_endian 1.0\ncomment map frame, metres\n"
-        f"element vertex {len(points)}\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
-    )
-    return head.encode() + np.ascontiguousarray(points).tobytes()
+        return point_files.ply(view.map.cloud())
 
 
 def keyframes_tum(view: RobotView) -> bytes:
