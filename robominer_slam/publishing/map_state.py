@@ -57,10 +57,8 @@ class StreamKeyframe:
 
     def vector7(self) -> FloatArray:
         """T_map_base as x y z (m), qx qy qz qw of length 1; shape (7,)."""
-        values = np.array(self.pose, dtype=np.float64)
-        values[:3] /= MILLIMETRES_PER_METRE
-        values[3:] /= np.linalg.norm(values[3:])
-        return values
+        vector: FloatArray = vectors7([self.pose])[0]
+        return vector
 
     def points_m(self) -> FloatArray:
         """Points in base_link at the keyframe, shape (m, 3), m."""
@@ -98,6 +96,14 @@ def keyframe(stamp_ns: int, pose: tuple[int, ...], points: PointArray) -> Stream
     data = np.ascontiguousarray(points, dtype="<i2").tobytes()
     digest = hashlib.blake2b(data, digest_size=_POINTS_DIGEST_BYTES).digest()
     return StreamKeyframe(stamp_ns, pose, points, digest)
+
+
+def vectors7(poses: ArrayLike) -> FloatArray:
+    """Poses of keyframes in m, quaternions of length 1: x y z qx qy qz qw; shape (n, 7)."""
+    values = np.array(poses, dtype=np.float64)
+    values[:, :3] /= MILLIMETRES_PER_METRE
+    values[:, 3:] /= np.linalg.norm(values[:, 3:], axis=1, keepdims=True)
+    return values
 
 
 def quantise_poses(poses: ArrayLike) -> NDArray[np.int32]:

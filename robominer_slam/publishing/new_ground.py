@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robominer_slam import geometry
-from robominer_slam.publishing.map_state import StreamKeyframe
+from robominer_slam.publishing.map_state import POINT_UNIT_M, StreamKeyframe, vectors7
 from robominer_slam.publishing.point_bytes import PointArray
 
 FloatArray = NDArray[np.float64]
@@ -34,16 +34,25 @@ def new_ground(
     """
     if not len(points):
         return points
-    keys = _cells(geometry.transform_points(T, points_m), cell)
+    places = geometry.transform_points(T, points_m)
+    keys = _cells(places, cell)
     _, first = np.unique(keys, return_index=True)
-    told = [
-        _cells(geometry.transform_points(geometry.from_vector7(one.vector7()), one.points_m()), cell)
-        for one in neighbours
-        if len(one.points)
-    ]
-    if told:
-        first = first[~np.isin(keys[first], np.concatenate(told))]
+    told = _placed([one for one in neighbours if len(one.points)])
+    inside = ((told >= places.min(axis=0) - cell) & (told <= places.max(axis=0) + cell)).all(axis=1)
+    if inside.any():
+        first = first[~np.isin(keys[first], _cells(told[inside], cell))]
     return points[np.sort(first)]
+
+
+def _placed(keyframes: list[StreamKeyframe]) -> FloatArray:
+    """Points of several keyframes in map, shape (m, 3), m."""
+    if not keyframes:
+        return np.zeros((0, 3))
+    T = geometry.from_vector7(vectors7([one.pose for one in keyframes]))
+    points = np.concatenate([one.points for one in keyframes]) * POINT_UNIT_M
+    of = np.repeat(np.arange(len(keyframes)), [len(one.points) for one in keyframes])
+    placed: FloatArray = np.einsum("mij,mj->mi", T[of, :3, :3], points) + T[of, :3, 3]
+    return placed
 
 
 def _cells(places: FloatArray, cell: float) -> NDArray[np.int64]:
