@@ -15,6 +15,7 @@ from robominer_slam.mapping.keyframe_map import KeyframeMap
 from robominer_slam.publisher import MAP
 from robominer_slam.publishing import cloud_messages, pose_messages, report_messages
 from robominer_slam.publishing.bus_messages import Query, QueryRefusedError, Reply
+from robominer_slam.publishing.map_answers import MapAnswers, MapQueryError
 from robominer_slam.publishing.map_stream import MapStreamEncoder
 from robominer_slam.publishing.zenoh_session import ZenohBus
 from robominer_slam.slam.saved_map import SavedMap
@@ -23,8 +24,6 @@ from robominer_slam.wall_clock import WallClock
 PATH_INTERVAL_NS = 1_000_000_000
 #: Of an answer to a query: well below what receivers refuse (1 MiB).
 MAX_PAYLOAD_BYTES = 512 * 1024
-#: Parameters that name a receiver's copy of the map.
-COPY = ("map_id", "epoch", "since")
 
 
 class MapService:
@@ -43,6 +42,7 @@ class MapService:
         self._clock = clock
         self._section = section
         self._stream = MapStreamEncoder(secrets.randbits(64), section.stream_cell)
+        self._answers = MapAnswers(self._stream)
         self._path_ns: int | None = None
         self._path_version = 0
 
@@ -59,6 +59,7 @@ class MapService:
             self._bus.put("path", self.path(self._clock.unix_ns(result.stamp_ns)))
 
     def _publish_updates(self) -> None:
+        self._answers.forget_old()
         whole = self.keyframe_map
         poses = geometry.to_vector7(whole.poses)
         for message in self._stream.update(whole.version, whole.keyframes, poses, self._clock.offset_ns):
@@ -73,6 +74,7 @@ class MapService:
         """Start anew with an empty map, under another id."""
         self.keyframe_map.clear()
         self._stream = MapStreamEncoder(secrets.randbits(64), self._section.stream_cell)
+        self._answers = MapAnswers(self._stream)
         self._publish_updates()
 
     @property
@@ -86,18 +88,19 @@ class MapService:
         return pose_messages.path(stamp_ns, MAP, stamps, geometry.to_vector7(self.keyframe_map.poses))
 
     def snapshot(self, query: Query) -> list[Reply]:
-        """The whole stream state, or with `map_id=`, `epoch=` and `since=` what a copy of that version lacks.
+        """The whole stream state or what a copy lacks, in portions where they are asked for: docs/map-stream.md.
 
         Raises:
-            QueryRefusedError: a parameter that is no number.
+            QueryRefusedError: a parameter that means nothing.
         """
-        known = {name: query.parameters[name] for name in COPY if name in query.parameters}
-        if not known:
-            return self._replies(self._stream.snapshot())
-        if known.keys() != set(COPY) or not all(text.isdecimal() for text in known.values()):
-            raise QueryRefusedError(f"expected whole numbers in {'=, '.join(COPY)}=, or none of them")
-        changes = self._stream.changes(*(int(known[name]) for name in COPY))
-        return self._replies(self._stream.snapshot() if changes is None else changes)
+        try:
+            messages = self._answers.answer(query.parameters)
+        except MapQueryError as error:
+            raise QueryRefusedError(str(error)) from error
+        if "limit" in query.parameters:
+            # One by one, so that what is more urgent comes in between.
+            return [Reply(message) for message in messages]
+        return self._replies(messages)
 
     @staticmethod
     def _replies(messages: list[bytes]) -> list[Reply]:

@@ -14,7 +14,7 @@ INTERVAL_NS = 10_000_000_000
 GREETINGS = 3
 #: The entry that always goes, and those of its figures that a remote operator needs.
 FIRST = "localization"
-FIGURES = ("localization.state", "paused", "keyframes", "map.version", "sigma_xy_m")
+FIGURES = ("localization.state", "paused", "keyframes", "map.version", "map.digest", "sigma_xy_m")
 #: A message longer than this is cut, so that one entry does not take another's place.
 MESSAGE_LENGTH = 60
 

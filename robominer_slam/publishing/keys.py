@@ -59,6 +59,8 @@ class Qos(NamedTuple):
 
 
 _POSES = Qos(zenoh.Priority.REAL_TIME, express=True)
+#: A large answer waits for everything else, and is not cut by a full link.
+_ANSWER = Qos(zenoh.Priority.DATA_LOW, zenoh.CongestionControl.BLOCK)
 _QOS = {
     "pose": _POSES,
     "odom": _POSES,
@@ -69,6 +71,7 @@ _QOS = {
     "status": Qos(zenoh.Priority.DATA_HIGH),
     "path": Qos(zenoh.Priority.DATA_LOW),
     "map/updates": Qos(zenoh.Priority.DATA_LOW, cache=256),
+    **dict.fromkeys(("map/snapshot", "map/cloud", "map/grid", "map/graph"), _ANSWER),
 }
 #: Raw sensors for a board that does the SLAM: late ones are of no use to it.
 _RAW = Qos(zenoh.Priority.INTERACTIVE_HIGH, express=True)
@@ -95,3 +98,8 @@ def qos_of(key: str) -> Qos:
     if key.startswith("raw/"):
         return _RAW
     return _QOS.get(key, Qos())
+
+
+def qos_of_answer(key: str) -> Qos:
+    """How answers to queries of a key travel."""
+    return _QOS[key] if key.startswith("map/") else Qos(zenoh.Priority.DATA_HIGH, zenoh.CongestionControl.BLOCK)

@@ -68,6 +68,11 @@ class Header(NamedTuple):
     parts: int
     digest: bytes
 
+    @property
+    def name(self) -> str:
+        """What `answer=` in a query of `map/snapshot` calls the update or snapshot that this is a part of."""
+        return f"{int(self.kind)}.{self.base_version}.{self.version}.{self.digest.hex()}"
+
 
 class KeyframeRecord(NamedTuple):
     """A new keyframe; `point_count` points follow in points records."""

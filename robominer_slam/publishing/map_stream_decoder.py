@@ -90,6 +90,21 @@ class MapStreamDecoder:
             self.counters["bad_message"] += 1
         return changed
 
+    def first_missing(self, name: str) -> int | None:
+        """Of an update or snapshot that is coming in parts, by `Header.name`, the first that is not there yet.
+
+        None if no part is wanted: all are there, or it was taken, or is of no use any more.
+        """
+        for header, gathering in self._gathering.items():
+            if header.name == name:
+                return next((part for part in range(header.parts) if part not in gathering.bodies), None)
+        return None
+
+    def forget(self, name: str) -> None:
+        """Let go of what came of an update or snapshot."""
+        for header in [header for header in self._gathering if header.name == name]:
+            del self._gathering[header]
+
     def _take(self, header: Header, body: bytes) -> bool:
         if self._stale(header):
             self.counters["stale"] += 1

@@ -12,7 +12,7 @@ import zenoh
 from zenoh import ext
 
 from robominer_slam.publishing.bus_messages import Query, QueryError, QueryRefusedError, Received, Reply, parameters_of
-from robominer_slam.publishing.keys import Qos, encoding_of, qos_of
+from robominer_slam.publishing.keys import Qos, encoding_of, qos_of, qos_of_answer
 from robominer_slam.publishing.senders import Peer, own_source, sender
 from robominer_slam.publishing.zenoh_settings import ZenohSettings, ZenohSetupError, open_session
 
@@ -239,6 +239,49 @@ class ZenohBus:
         reason = "; ".join(errors) or "no answer; is the robot's program running?"
         raise QueryError(f"{self._full(key)}: {reason}")
 
+    def ask(
+        self,
+        key: str,
+        parameters: Mapping[str, str],
+        on_reply: Callable[[Received], None],
+        on_end: Callable[[], None],
+        timeout_s: float = DEFAULT_TIMEOUT_S,
+    ) -> None:
+        """Ask, and do not wait: answers come in a thread of Zenoh's.
+
+        Args:
+            key: under the prefix.
+            parameters: go into the selector; values must not contain `;`.
+            on_reply: called with each answer that is no error.
+            on_end: called once, when no more will come, whether any came or not.
+            timeout_s: after this long no more will come.
+        """
+
+        def take(reply: zenoh.Reply) -> None:
+            try:
+                if reply.ok is not None:
+                    on_reply(self._received(reply.ok))
+                elif reply.err is not None:
+                    log.warning("%s: refused: %s", key, reply.err.payload.to_bytes().decode("utf-8", "replace"))
+            # Whatever it is must not end Zenoh's thread, and must be seen.
+            except Exception:
+                log.exception("an answer on %s could not be taken", key)
+
+        def end() -> None:
+            try:
+                on_end()
+            except Exception:
+                log.exception("the end of an answer on %s could not be taken", key)
+
+        text = ";".join(f"{name}={value}" for name, value in parameters.items())
+        self._session.get(
+            self._full(key) + (f"?{text}" if text else ""),
+            zenoh.handlers.Callback(take, end),
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=timeout_s,
+            priority=qos_of_answer(key).priority,
+        )
+
     def _answer(self, query: zenoh.Query, key: str, callback: Callable[[Query], Reply | Iterable[Reply]]) -> None:
         # A query with wildcards is answered on the key that was declared, if that has none itself.
         asked = self._relative(str(query.key_expr)) if "*" in key else key
@@ -249,7 +292,14 @@ class ZenohBus:
         replies = [found] if isinstance(found, Reply) else found
         for reply in replies:
             encoding = encoding_of(asked) if reply.encoding is None else reply.encoding
-            query.reply(self._full(asked), reply.payload, encoding=encoding)
+            qos = qos_of_answer(asked)
+            query.reply(
+                self._full(asked),
+                reply.payload,
+                encoding=encoding,
+                priority=qos.priority,
+                congestion_control=qos.congestion,
+            )
 
     def _peers(self) -> list[Peer]:
         """Who may have sent a command."""
