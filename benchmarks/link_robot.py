@@ -13,7 +13,7 @@ import json
 import sys
 import threading
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +24,7 @@ from robominer_slam import geometry
 from robominer_slam.configuration.model import ZenohSection
 from robominer_slam.publishing import pose_messages, report_messages
 from robominer_slam.publishing.bus_messages import Query, Reply
-from robominer_slam.publishing.map_answers import MapAnswers
-from robominer_slam.publishing.map_stream import MapStreamEncoder
+from robominer_slam.publishing.map_publisher import MapPublisher
 from robominer_slam.publishing.report_messages import Diagnostic, Level
 from robominer_slam.publishing.robot_settings import robot_settings
 from robominer_slam.publishing.telemetry import Telemetry, encode
@@ -51,20 +50,16 @@ class Source:
     points: NDArray[np.floating]
 
 
-@dataclass
 class GrowingMap:
     """A corridor, keyframe by keyframe, and its stream."""
 
-    total: int
-    stream: MapStreamEncoder = field(default_factory=lambda: MapStreamEncoder(MAP_ID, CELL))
-
-    def __post_init__(self) -> None:
-        self.answers = MapAnswers(self.stream)
-        self._drive = drive("corridor", 1, self.total)
+    def __init__(self, bus: ZenohBus, total: int) -> None:
+        self.publisher = MapPublisher(bus, MAP_ID, CELL)
+        self._drive = drive("corridor", 1, total)
         self._sources: list[Source] = []
         self._poses: list[NDArray[np.float64]] = []
 
-    def grow(self, count: int = 1, shift_m: float = 0.0) -> list[bytes]:
+    def grow(self, count: int = 1, shift_m: float = 0.0) -> None:
         """Some more keyframes in one version, after moving the whole map by some metres."""
         for _ in range(count):
             keyframe, _ = next(self._drive)
@@ -73,7 +68,7 @@ class GrowingMap:
         if shift_m:
             for pose in self._poses:
                 pose[0] += shift_m
-        return self.stream.update(self.stream.state.version + 1, self._sources, np.array(self._poses))
+        self.publisher.update(self.publisher.state.version + 1, self._sources, np.array(self._poses))
 
 
 def serve(bus: ZenohBus, world: GrowingMap, step_s: float, correct_every: int, stop: threading.Event) -> None:
@@ -82,8 +77,7 @@ def serve(bus: ZenohBus, world: GrowingMap, step_s: float, correct_every: int, s
 
     def answer(query: Query) -> list[Reply]:
         with lock:
-            messages = world.answers.answer(query.parameters)
-        return [Reply(message) for message in messages] if "limit" in query.parameters else [Reply(b"".join(messages))]
+            return world.publisher.answer(query)
 
     bus.queryable("map/snapshot", answer)
     status = RemoteStatus()
@@ -91,7 +85,7 @@ def serve(bus: ZenohBus, world: GrowingMap, step_s: float, correct_every: int, s
     begun, frame, keyframe_s, keyframes = time.monotonic(), 0, time.monotonic(), 0
     while not stop.wait(max(0.0, begun + frame * FRAME_S - time.monotonic())):
         now_ns, pose = time.time_ns(), np.array([0.0, 0, 0, 0, 0, 0, 1])
-        state = world.stream.state
+        state = world.publisher.state
         bus.put("pose", pose_messages.pose_with_covariance(now_ns, "map", pose, np.eye(6)))
         if frame % TELEMETRY_FRAMES == 0:
             message = Telemetry(
@@ -111,16 +105,14 @@ def serve(bus: ZenohBus, world: GrowingMap, step_s: float, correct_every: int, s
             keyframes += 1
             shift = CORRECTION_M if correct_every and keyframes % correct_every == 0 else 0.0
             with lock:
-                messages = world.grow(1, shift)
-            for one in messages:
-                bus.put("map/updates", one)
+                world.grow(1, shift)
             tell(world)
         frame += 1
 
 
 def tell(world: GrowingMap) -> None:
     """The map as it is now, for who compares."""
-    state = world.stream.state
+    state = world.publisher.state
     print(json.dumps({"t": time.time(), "version": state.version, "digest": state.digest().hex()}), flush=True)
 
 
@@ -132,14 +124,15 @@ def main() -> None:
     parser.add_argument("--step", type=float, default=1.7, help="Seconds between keyframes; 0: none.")
     parser.add_argument("--correct-every", type=int, default=0, help="Keyframes between corrections of the whole map.")
     arguments = parser.parse_args()
-    world = GrowingMap(arguments.keyframes + 100_000)
-    if arguments.keyframes:
-        world.grow(arguments.keyframes)
     section = ZenohSection(credentials=str(arguments.credentials), listen=(arguments.listen,))
     stop = threading.Event()
     threading.Thread(target=lambda: (sys.stdin.read(), stop.set()), name="end-of-input", daemon=True).start()
     with ZenohBus(robot_settings(section, Path.cwd(), PREFIX), PREFIX) as bus:
-        size = len(b"".join(world.stream.snapshot()))
+        world = GrowingMap(bus, arguments.keyframes + 100_000)
+        if arguments.keyframes:
+            world.grow(arguments.keyframes)
+        whole = world.publisher.answer(Query("map/snapshot", {}, b""))
+        size = sum(len(reply.payload) for reply in whole)
         print(json.dumps({"ready": True, "snapshot_bytes": size}), flush=True)
         tell(world)
         serve(bus, world, arguments.step, arguments.correct_every, stop)

@@ -15,15 +15,12 @@ from robominer_slam.mapping.keyframe_map import KeyframeMap
 from robominer_slam.publisher import MAP
 from robominer_slam.publishing import cloud_messages, pose_messages, report_messages
 from robominer_slam.publishing.bus_messages import Query, QueryRefusedError, Reply
-from robominer_slam.publishing.map_answers import MapAnswers, MapQueryError
-from robominer_slam.publishing.map_stream import MapStreamEncoder
+from robominer_slam.publishing.map_publisher import MapPublisher
 from robominer_slam.publishing.zenoh_session import ZenohBus
 from robominer_slam.slam.saved_map import SavedMap
 from robominer_slam.wall_clock import WallClock
 
 PATH_INTERVAL_NS = 1_000_000_000
-#: Of an answer to a query: well below what receivers refuse (1 MiB).
-MAX_PAYLOAD_BYTES = 512 * 1024
 
 
 class MapService:
@@ -41,8 +38,7 @@ class MapService:
         self._bus = bus
         self._clock = clock
         self._section = section
-        self._stream = MapStreamEncoder(secrets.randbits(64), section.stream_cell)
-        self._answers = MapAnswers(self._stream)
+        self._publisher = self._new_publisher()
         self._path_ns: int | None = None
         self._path_version = 0
 
@@ -59,11 +55,12 @@ class MapService:
             self._bus.put("path", self.path(self._clock.unix_ns(result.stamp_ns)))
 
     def _publish_updates(self) -> None:
-        self._answers.forget_old()
         whole = self.keyframe_map
         poses = geometry.to_vector7(whole.poses)
-        for message in self._stream.update(whole.version, whole.keyframes, poses, self._clock.offset_ns):
-            self._bus.put("map/updates", message)
+        self._publisher.update(whole.version, whole.keyframes, poses, self._clock.offset_ns)
+
+    def _new_publisher(self) -> MapPublisher:
+        return MapPublisher(self._bus, secrets.randbits(64), self._section.stream_cell)
 
     def load(self, known: SavedMap) -> None:
         """Start with a map that was saved."""
@@ -73,14 +70,13 @@ class MapService:
     def new_map(self) -> None:
         """Start anew with an empty map, under another id."""
         self.keyframe_map.clear()
-        self._stream = MapStreamEncoder(secrets.randbits(64), self._section.stream_cell)
-        self._answers = MapAnswers(self._stream)
+        self._publisher = self._new_publisher()
         self._publish_updates()
 
     @property
     def digest(self) -> str:
         """Digest of the map as the stream carries it."""
-        return self._stream.state.digest().hex()
+        return self._publisher.digest
 
     def path(self, stamp_ns: int) -> bytes:
         """nav_msgs/Path of the keyframes."""
@@ -88,29 +84,12 @@ class MapService:
         return pose_messages.path(stamp_ns, MAP, stamps, geometry.to_vector7(self.keyframe_map.poses))
 
     def snapshot(self, query: Query) -> list[Reply]:
-        """The whole stream state or what a copy lacks, in portions where they are asked for: docs/map-stream.md.
+        """The stream's state or what a copy of it lacks.
 
         Raises:
             QueryRefusedError: a parameter that means nothing.
         """
-        try:
-            messages = self._answers.answer(query.parameters)
-        except MapQueryError as error:
-            raise QueryRefusedError(str(error)) from error
-        if "limit" in query.parameters:
-            # One by one, so that what is more urgent comes in between.
-            return [Reply(message) for message in messages]
-        return self._replies(messages)
-
-    @staticmethod
-    def _replies(messages: list[bytes]) -> list[Reply]:
-        """Messages concatenated: one reply but for large maps."""
-        payloads = [b""]
-        for message in messages:
-            if len(payloads[-1]) + len(message) > MAX_PAYLOAD_BYTES:
-                payloads.append(b"")
-            payloads[-1] += message
-        return [Reply(payload) for payload in payloads]
+        return self._publisher.answer(query)
 
     def cloud(self) -> list[Reply]:
         """PointCloud2 of the map."""

@@ -6,7 +6,8 @@ Quality of service, and why:
 - telemetry: the same for remote links, behind the poses where both go.
 - map/updates: every message counts, but waiting is worse: a publisher that blocks waits up to 5 s and then loses
   the link for everything else. So it is dropped when the link is full, in messages of a few KB, and what was lost
-  is had again from the publisher's cache, or by the snapshot where that is too old.
+  is fetched by queries (map_receiver.py), or had again from the publisher's cache.
+- answers about the map: behind everything else, and not dropped; large ones only on fast links, or in portions.
 - tf_static: latched; a cache of one message for late joiners.
 """
 

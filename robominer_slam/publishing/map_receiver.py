@@ -164,9 +164,7 @@ class MapReceiver:
             self._asked_s, self._got_bytes = now, 0
             timeout_s = self._timeout_s
             self.counters["queries"] += 1
-        self._bus.ask(
-            SNAPSHOT, wanted, lambda received: self._reply(received), lambda: self._end(number), timeout_s
-        )
+        self._bus.ask(SNAPSHOT, wanted, lambda received: self._reply(received), lambda: self._end(number), timeout_s)
 
     def _wanted(self, now: float) -> dict[str, str] | None:
         """Parameters of the query that is due."""

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from robominer_slam.publishing.map_records import MAX_MESSAGE_BYTES
 from robominer_slam.security.access_rules import PLAIN_PROTOCOLS
 from robominer_slam.security.credentials import Credentials
 
 #: What `status` may weigh on a remote link, bytes.
 REMOTE_STATUS_BYTES = 400
+#: What a message may weigh on a remote link, bytes. Updates of the map that take more are fetched (map_publisher.py).
+REMOTE_BYTES = {"status": REMOTE_STATUS_BYTES, "map/updates": MAX_MESSAGE_BYTES}
 #: Most messages a second of the ROS topics on a remote link. `tf_static` is sent once, and `status` has its own rule.
 REMOTE_ROS_HZ = {"pose": 1.0, "odom": 0.1, "tf": 0.1, "path": 0.1, "whiskers/points": 0.1}
 #: `status` goes out in full and then, at once, in short. The full one is too large for TLS links; on the others the
@@ -55,11 +58,14 @@ def remote_rates(prefix: str, *, remote_ros: bool) -> dict[str, object]:
     if not remote_ros:
         rules = [{"key_expr": f"{prefix}/{key}", "freq": rate} for key, rate in REMOTE_ROS_HZ.items()]
         downsampling.append({"flows": ["egress"], "messages": ["put"], "link_protocols": ["tls"], "rules": rules})
-    too_large = {
-        "flows": ["egress"],
-        "messages": ["put"],
-        "link_protocols": ["tls"],
-        "key_exprs": [status],
-        "size_limit": REMOTE_STATUS_BYTES,
-    }
-    return {"downsampling": downsampling, "low_pass_filter": [too_large]}
+    too_large = [
+        {
+            "flows": ["egress"],
+            "messages": ["put"],
+            "link_protocols": ["tls"],
+            "key_exprs": [f"{prefix}/{key}"],
+            "size_limit": limit,
+        }
+        for key, limit in REMOTE_BYTES.items()
+    ]
+    return {"downsampling": downsampling, "low_pass_filter": too_large}
