@@ -2,7 +2,8 @@
 
     python -m benchmarks.link_operator --credentials FOLDER --connect tls/HOST:PORT
 
-Prints JSON lines: each telemetry message with how late it is, and five times a second the state of the copy of the map.
+A line on its input makes it pause the robot's mapping, the end of its input ends it. Prints JSON lines: each message
+with how late it is, and five times a second the state of the copy of the map.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from robominer_slam.publishing.bus_messages import Received
 from robominer_slam.publishing.client_settings import client_settings
 from robominer_slam.publishing.map_receiver import MapReceiver
 from robominer_slam.publishing.pose_messages import POSE_WITH_COVARIANCE
+from robominer_slam.publishing.report_messages import DIAGNOSTIC_ARRAY
 from robominer_slam.publishing.zenoh_session import ZenohBus
 
 PREFIX = "robominer/rm3"
@@ -49,6 +51,15 @@ def stamp_s(received: Received) -> float | None:
     return None
 
 
+def told_map(received: Received) -> dict[str, str]:
+    """What a `status` says of the robot's map."""
+    if received.key != "status":
+        return {}
+    entries = deserialize(received.payload, DIAGNOSTIC_ARRAY).status
+    told = {value.key: value.value for entry in entries for value in entry.values}
+    return {"robot_version": told.get("map.version", ""), "robot_digest": told.get("map.digest", "")}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--credentials", type=Path)
@@ -56,14 +67,22 @@ def main() -> None:
     parser.add_argument("--map", choices=("receiver", "history", "whole", "none"), default="receiver")
     arguments = parser.parse_args()
     log, stop = Log(), threading.Event()
-    threading.Thread(target=lambda: (sys.stdin.read(), stop.set()), name="end-of-input", daemon=True).start()
+    pause = threading.Event()
+
+    def read() -> None:
+        for _ in sys.stdin:
+            pause.set()
+        stop.set()
+
+    # Reading blocks: in a thread of its own.
+    threading.Thread(target=read, name="input", daemon=True).start()
     with ZenohBus(client_settings(arguments.connect, arguments.credentials, CONNECT_TIMEOUT_S), PREFIX) as bus:
         receiver = MapReceiver(bus)
 
         def take(received: Received) -> None:
             stamp = stamp_s(received)
             late = None if stamp is None else round(time.time() - stamp, 4)
-            log.line(key=received.key, bytes=len(received.payload), late=late)
+            log.line(key=received.key, bytes=len(received.payload), late=late, **told_map(received))
             receiver.take(received)
 
         for key in ("telemetry", "pose", "odom", "tf", "path", "whiskers/points", "status", "map/updates"):
@@ -76,6 +95,9 @@ def main() -> None:
         while not stop.wait(TICK_S):
             if arguments.map == "receiver":
                 receiver.tick()
+            if pause.is_set():
+                pause.clear()
+                log.line(paused=bus.get("cmd/pause")[0].payload.decode())
             state = receiver.state
             log.line(
                 version=0 if state is None else state.version, digest=receiver.digest, behind=receiver.behind,

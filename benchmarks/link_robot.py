@@ -2,8 +2,8 @@
 
     python -m benchmarks.link_robot --credentials FOLDER --listen tls/ADDRESS:PORT [--keyframes 4000] [--step 1.7]
 
-No SLAM, so that the map can be of any size at once and the machine has time for the link. Poses come 25 times a second and
-telemetry four times, as from the daemon. Each new keyframe is printed as a JSON line with the map's version and digest.
+No SLAM, so that the map can be of any size at once and the machine has time for the link. Poses come 25 times a
+second and telemetry four times, as from the daemon. Ends with its input.
 """
 
 from __future__ import annotations
@@ -79,7 +79,14 @@ def serve(bus: ZenohBus, world: GrowingMap, step_s: float, correct_every: int, s
         with lock:
             return world.publisher.answer(query)
 
+    paused = threading.Event()
+
+    def pause(_: Query) -> Reply:
+        paused.set()
+        return Reply(b'{"ok": true, "message": "paused"}')
+
     bus.queryable("map/snapshot", answer)
+    bus.queryable("cmd/pause", pause)
     status = RemoteStatus()
     none = np.zeros((8, 8))
     begun, frame, keyframe_s, keyframes = time.monotonic(), 0, time.monotonic(), 0
@@ -94,26 +101,19 @@ def serve(bus: ZenohBus, world: GrowingMap, step_s: float, correct_every: int, s
             )  # fmt: skip
             bus.put("telemetry", encode(message))
         if frame % STATUS_FRAMES == 0:
-            values = {"localization.state": "tracking", "map.version": str(state.version)}
-            values["map.digest"] = state.digest().hex()
+            values = {"localization.state": "tracking", "paused": str(paused.is_set()).lower()}
+            values |= {"map.version": str(state.version), "map.digest": state.digest().hex()}
             entries = [Diagnostic("localization", Level.OK, "tracking", values)]
             bus.put("status", report_messages.diagnostics(now_ns, entries) + bytes(400))
             if status.due(time.monotonic_ns(), entries, bus.remote_links()):
                 bus.put("status", short_status(now_ns, entries))
-        if step_s and time.monotonic() - keyframe_s >= step_s:
+        if step_s and not paused.is_set() and time.monotonic() - keyframe_s >= step_s:
             keyframe_s += step_s
             keyframes += 1
             shift = CORRECTION_M if correct_every and keyframes % correct_every == 0 else 0.0
             with lock:
                 world.grow(1, shift)
-            tell(world)
         frame += 1
-
-
-def tell(world: GrowingMap) -> None:
-    """The map as it is now, for who compares."""
-    state = world.publisher.state
-    print(json.dumps({"t": time.time(), "version": state.version, "digest": state.digest().hex()}), flush=True)
 
 
 def main() -> None:
@@ -134,7 +134,6 @@ def main() -> None:
         whole = world.publisher.answer(Query("map/snapshot", {}, b""))
         size = sum(len(reply.payload) for reply in whole)
         print(json.dumps({"ready": True, "snapshot_bytes": size}), flush=True)
-        tell(world)
         serve(bus, world, arguments.step, arguments.correct_every, stop)
 
 

@@ -72,7 +72,6 @@ _QOS = {
     "status": Qos(zenoh.Priority.DATA_HIGH),
     "path": Qos(zenoh.Priority.DATA_LOW),
     "map/updates": Qos(zenoh.Priority.DATA_LOW, cache=256),
-    **dict.fromkeys(("map/snapshot", "map/cloud", "map/grid", "map/graph"), _ANSWER),
 }
 #: Raw sensors for a board that does the SLAM: late ones are of no use to it.
 _RAW = Qos(zenoh.Priority.INTERACTIVE_HIGH, express=True)
@@ -101,6 +100,6 @@ def qos_of(key: str) -> Qos:
     return _QOS.get(key, Qos())
 
 
-def qos_of_answer(key: str) -> Qos:
-    """How answers to queries of a key travel."""
-    return _QOS[key] if key.startswith("map/") else Qos(zenoh.Priority.DATA_HIGH, zenoh.CongestionControl.BLOCK)
+def qos_of_query(key: str) -> Qos:
+    """How queries of a key travel, and their answers with them."""
+    return _ANSWER if key.startswith("map/") else Qos(zenoh.Priority.DATA_HIGH, zenoh.CongestionControl.BLOCK)

@@ -1,7 +1,7 @@
 """Answers to queries of `map/snapshot`: the whole map or what a copy lacks, in portions that a slow link can take.
 
-The parameters are in docs/map-stream.md. An answer that was begun is kept, so that who lost the link in the middle of it
-goes on where it was, whatever has changed meanwhile: what came after it is had by another query.
+The parameters are in docs/map-stream.md. An answer that was begun is kept, so that who lost the link in the middle of
+it goes on where it was, whatever has changed meanwhile: what came after it is had by another query.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """A receiver of the map: keeps a copy equal to the robot's over a link that is slow and breaks. No thread of its own.
 
 Updates are taken as they come. What is missing is asked for by queries of `map/snapshot`, one at a time, in portions
-small enough that poses are not held up behind them; how much the robot has is known from `telemetry` and `status`. Zenoh's
-own history is not used: after each outage it would send up to 256 messages again, most of them known.
+small enough that poses are not held up behind them; how much the robot has is known from `telemetry` and `status`.
+Zenoh's own history is not used: after each outage it would send up to 256 messages again, most of them known.
 """
 
 from __future__ import annotations

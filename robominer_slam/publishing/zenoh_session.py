@@ -12,7 +12,7 @@ import zenoh
 from zenoh import ext
 
 from robominer_slam.publishing.bus_messages import Query, QueryError, QueryRefusedError, Received, Reply, parameters_of
-from robominer_slam.publishing.keys import Qos, encoding_of, qos_of, qos_of_answer
+from robominer_slam.publishing.keys import Qos, encoding_of, qos_of, qos_of_query
 from robominer_slam.publishing.senders import Peer, own_source, sender
 from robominer_slam.publishing.zenoh_settings import ZenohSettings, ZenohSetupError, open_session
 
@@ -225,6 +225,8 @@ class ZenohBus:
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=timeout_s,
             payload=payload,
+            priority=qos_of_query(key).priority,
+            congestion_control=qos_of_query(key).congestion,
             source_info=own_source(self._session, self._full(key)) if key.startswith("cmd/") else None,
         )
         received: list[Received] = []
@@ -280,7 +282,8 @@ class ZenohBus:
             zenoh.handlers.Callback(take, end),
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=timeout_s,
-            priority=qos_of_answer(key).priority,
+            priority=qos_of_query(key).priority,
+            congestion_control=qos_of_query(key).congestion,
         )
 
     def _answer(self, query: zenoh.Query, key: str, callback: Callable[[Query], Reply | Iterable[Reply]]) -> None:
@@ -293,14 +296,8 @@ class ZenohBus:
         replies = [found] if isinstance(found, Reply) else found
         for reply in replies:
             encoding = encoding_of(asked) if reply.encoding is None else reply.encoding
-            qos = qos_of_answer(asked)
-            query.reply(
-                self._full(asked),
-                reply.payload,
-                encoding=encoding,
-                priority=qos.priority,
-                congestion_control=qos.congestion,
-            )
+            # It travels as the query did.
+            query.reply(self._full(asked), reply.payload, encoding=encoding)
 
     def _peers(self) -> list[Peer]:
         """Who may have sent a command."""
