@@ -133,7 +133,8 @@ def main() -> None:
             world.grow(arguments.keyframes)
         whole = world.publisher.answer(Query("map/snapshot", {}, b""))
         size = sum(len(reply.payload) for reply in whole)
-        print(json.dumps({"ready": True, "snapshot_bytes": size}), flush=True)
+        points = sum(len(one.points) for one in world.publisher.state.keyframes.values())
+        print(json.dumps({"ready": True, "snapshot_bytes": size, "points": points}), flush=True)
         serve(bus, world, arguments.step, arguments.correct_every, stop)
 
 
