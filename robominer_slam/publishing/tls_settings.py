@@ -12,6 +12,8 @@ REMOTE_STATUS_BYTES = 400
 REMOTE_BYTES = {"status": REMOTE_STATUS_BYTES, "map/updates": MAX_MESSAGE_BYTES}
 #: Most messages a second of the ROS topics on a remote link. `tf_static` is sent once, and `status` has its own rule.
 REMOTE_ROS_HZ = {"pose": 1.0, "odom": 0.1, "tf": 0.1, "path": 0.1, "whiskers/points": 0.1}
+#: And the largest of them: 500 poses of a path would take a slow link for some seconds. Its keyframes are in the map.
+REMOTE_ROS_BYTES = {"path": MAX_MESSAGE_BYTES}
 #: `status` goes out in full and then, at once, in short. The full one is too large for TLS links; on the others the
 #: short one comes too soon after it. Full ones are a second apart.
 _LOCAL_STATUS_HZ = 2.0
@@ -66,6 +68,6 @@ def remote_rates(prefix: str, *, remote_ros: bool) -> dict[str, object]:
             "key_exprs": [f"{prefix}/{key}"],
             "size_limit": limit,
         }
-        for key, limit in REMOTE_BYTES.items()
+        for key, limit in (REMOTE_BYTES if remote_ros else REMOTE_BYTES | REMOTE_ROS_BYTES).items()
     ]
     return {"downsampling": downsampling, "low_pass_filter": too_large}
