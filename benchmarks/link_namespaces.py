@@ -33,6 +33,15 @@ class Traffic:
     to_robot: int
 
 
+def why_not() -> str:
+    """Why there can be no namespaces here; empty where there can."""
+    if os.geteuid() != 0:
+        return "network namespaces need root"
+    if shutil.which("ip") is None or shutil.which("tc") is None:
+        return "network namespaces need `ip` and `tc`: apt-get install -y iproute2"
+    return ""
+
+
 class Link:
     """The namespaces, made and taken away; use it with `with`."""
 
@@ -45,10 +54,8 @@ class Link:
         Raises:
             NamespacesError: not root, no iproute2, or a kernel without what is needed.
         """
-        if os.geteuid() != 0:
-            raise NamespacesError("network namespaces need root")
-        if shutil.which("ip") is None or shutil.which("tc") is None:
-            raise NamespacesError("network namespaces need `ip` and `tc`: apt-get install -y iproute2")
+        if missing := why_not():
+            raise NamespacesError(missing)
         tag = f"rms{os.getpid() % 100_000}"
         self.robot, self._radio, self.operator = f"{tag}r", f"{tag}x", f"{tag}o"
         try:

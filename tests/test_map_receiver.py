@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from robominer_slam.publishing.bus_messages import Query, QueryRefusedError, Received
 from robominer_slam.publishing.map_answers import KEEP_S, MAX_KEPT_BYTES, MapAnswers
 from robominer_slam.publishing.map_publisher import MapPublisher, update_payloads
-from robominer_slam.publishing.map_records import unpack_messages
 from robominer_slam.publishing.map_receiver import GRACE_S, MIN_PORTION, MapReceiver
+from robominer_slam.publishing.map_records import unpack_messages
 from robominer_slam.publishing.map_stream import MAX_MESSAGE_BYTES, MapStreamEncoder
 from tests.test_map_stream import MAP_ID, World
 
@@ -35,7 +35,7 @@ class Wire:
             self.receiver.take(Received(key, payload, "", None))
 
     def subscriber(self, key: str, callback: Callable[[Received], None]) -> None:
-        raise AssertionError("messages are handed over here")
+        raise AssertionError(f"{key}: {callback} is not needed, messages are handed over here")
 
     def ask(
         self,
@@ -45,6 +45,7 @@ class Wire:
         on_end: Callable[[], None],
         timeout_s: float,
     ) -> None:
+        assert key == "map/snapshot"
         assert not self._pending, "one query at a time"
         assert 1.0 < timeout_s < 20.0
         self.asked.append(parameters)
@@ -189,7 +190,7 @@ def test_a_query_whose_end_never_comes_does_not_hold_the_receiver_up() -> None:
 def test_portions_grow_where_the_link_is_fast_and_shrink_where_it_is_slow() -> None:
     wire = Wire(7, points=4000, cell=None)
     wire.lost = lambda: True
-    for _ in range(60):
+    for _ in range(150):
         wire.step()
     wire.lost = lambda: False
     wire.tick()
