@@ -71,7 +71,9 @@ class GrowingMap:
         self.publisher.update(self.publisher.state.version + 1, self._sources, np.array(self._poses))
 
 
-def serve(bus: ZenohBus, world: GrowingMap, step_s: float, correct_every: int, stop: threading.Event) -> None:
+def serve(
+    bus: ZenohBus, world: GrowingMap, step_s: float, hurry_s: float, correct_every: int, stop: threading.Event
+) -> None:
     """Publish until told to stop."""
     lock = threading.Lock()
 
@@ -107,6 +109,8 @@ def serve(bus: ZenohBus, world: GrowingMap, step_s: float, correct_every: int, s
             bus.put("status", report_messages.diagnostics(now_ns, entries) + bytes(400))
             if status.due(time.monotonic_ns(), entries, bus.remote_links()):
                 bus.put("status", short_status(now_ns, entries))
+        if hurry_s and time.monotonic() - begun > hurry_s:
+            step_s, hurry_s = 10.0 * step_s, 0.0
         if step_s and not paused.is_set() and time.monotonic() - keyframe_s >= step_s:
             keyframe_s += step_s
             keyframes += 1
@@ -122,6 +126,7 @@ def main() -> None:
     parser.add_argument("--listen", required=True)
     parser.add_argument("--keyframes", type=int, default=0, help="In the map from the beginning.")
     parser.add_argument("--step", type=float, default=1.7, help="Seconds between keyframes; 0: none.")
+    parser.add_argument("--hurry", type=float, default=0.0, help="After so many seconds, ten times as slow; 0: never.")
     parser.add_argument("--correct-every", type=int, default=0, help="Keyframes between corrections of the whole map.")
     arguments = parser.parse_args()
     section = ZenohSection(credentials=str(arguments.credentials), listen=(arguments.listen,))
@@ -135,7 +140,7 @@ def main() -> None:
         size = sum(len(reply.payload) for reply in whole)
         points = sum(len(one.points) for one in world.publisher.state.keyframes.values())
         print(json.dumps({"ready": True, "snapshot_bytes": size, "points": points}), flush=True)
-        serve(bus, world, arguments.step, arguments.correct_every, stop)
+        serve(bus, world, arguments.step, arguments.hurry, arguments.correct_every, stop)
 
 
 if __name__ == "__main__":

@@ -38,6 +38,7 @@ class Result:
         equal: whether the digest was the robot's at the end, at the same version.
         map_bytes: answers to queries.
         resident_mb: of the robot's process, once a second.
+        down_mb: the same at the beginning and the end of the longest outage.
     """
 
     seconds: float
@@ -52,6 +53,7 @@ class Result:
     equal: bool = False
     map_bytes: int = 0
     resident_mb: list[float] = field(default_factory=list)
+    down_mb: tuple[float, float] = (0.0, 0.0)
 
     def late(self, percent: float) -> float:
         """Percentile of the lateness, s."""
@@ -96,12 +98,16 @@ class Scenario:
             ]  # fmt: skip
             resident: list[float] = []
             returns: list[float] = []
+            longest, down_mb = 0.0, (0.0, 0.0)
             with self._process(self._link.operator, command, "operator.log") as operator:
                 for up_s, down_s in outages:
                     _watch(machine, operator, up_s, resident)
                     self._link.cut()
+                    cut = resident[-1]
                     try:
                         _watch(machine, operator, down_s, resident)
+                        if down_s > longest:
+                            longest, down_mb = down_s, (cut, resident[-1])
                     finally:
                         self._link.mend()
                     returns.append(time.time())
@@ -111,7 +117,7 @@ class Scenario:
                 _tell(operator)
                 time.sleep(3.0)
         result = summary(_lines(self._folder / "operator.log"), begun, returns)
-        result.seconds, result.resident_mb = seconds, resident
+        result.seconds, result.resident_mb, result.down_mb = seconds, resident, down_mb
         result.kbit_down = (after.to_operator - before.to_operator) * 8e-3 / seconds
         result.kbit_up = (after.to_robot - before.to_robot) * 8e-3 / seconds
         return result

@@ -4,13 +4,14 @@
 
 Makes network namespaces with a rate limit between them and sets the link down and up: needs root and iproute2, and ends
 with 2 where it cannot. The robot has TLS with keys of its own. By default it is `benchmarks.link_robot`, which has no
-SLAM; with a recording, `drive` and `outages` are the daemon itself, with the recording's devices served in real time.
+SLAM; with a recording, `drive`, `outages` and `down` are the daemon itself, with the recording's devices served in real time.
 
     drive    nothing fails: kbit/s on the wire, bytes by topic
     outages  2 s without link in each minute, and a correction of the whole map now and then
     random   N outages of 0.2 to 6 s, 1 to 6 s apart: is the digest the robot's?
     late     joins when the map has about 1 MB
-    away     60 s without link, in which the robot makes the map of 10 minutes (ten times as fast), and its memory
+    away     60 s without link, in which the robot makes the map of 10 minutes, ten times as fast
+    down     two minutes with link and two without: the robot's memory
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from benchmarks.link_scenario import Outages, Result, Scenario
 
 #: Keyframes of `late`: about 1 MB of map stream; and of the others, some 20 m.
 LARGE_MAP, SMALL_MAP = "4800", "80"
-AWAY_S = 60.0
+AWAY_S, DOWN_S = 60.0, 120.0
 POINT_BYTES = 12
 HEAD = (
     f"{'run':<8} {'pose late s: median':>20} {'95 %':>6} {'max':>6} {'kbit/s':>7} {'up':>5} {'joined s':>9} "
@@ -85,7 +86,7 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=3.0, help="Of `drive` and `outages`.")
     parser.add_argument("--rate", type=float, default=64.0, help="Of the link, kbit/s.")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", choices=("drive", "outages", "random", "late", "away"), action="append")
+    parser.add_argument("--only", choices=("drive", "outages", "random", "late", "away", "down"), action="append")
     arguments = parser.parse_args()
     minutes = max(1, round(arguments.minutes))
 
@@ -110,11 +111,15 @@ def main() -> int:
         return scenario.run(scenario.synthetic("--keyframes", LARGE_MAP), [], settle_s=240.0)
 
     def away(scenario: Scenario, _: Path) -> Result:
-        command = scenario.synthetic("--keyframes", SMALL_MAP, "--step", "0.17")
+        command = scenario.synthetic("--keyframes", SMALL_MAP, "--step", "0.17", "--hurry", "72")
         return scenario.run(command, [(10.0, AWAY_S)], settle_s=30.0)
 
+    def down(scenario: Scenario, folder: Path) -> Result:
+        command, ready = robot(scenario, folder, "--keyframes", SMALL_MAP)
+        return scenario.run(command, [(DOWN_S, DOWN_S)], settle_s=15.0, ready=ready)
+
     runs: dict[str, Callable[[Scenario, Path], Result]] = {
-        "drive": drive, "outages": outages, "random": at_random, "late": late, "away": away,
+        "drive": drive, "outages": outages, "random": at_random, "late": late, "away": away, "down": down,
     }  # fmt: skip
     print(HEAD, flush=True)
     for name, run in runs.items():
@@ -130,6 +135,11 @@ def main() -> int:
                 return 2
             print(line(name, result))
             print(topics(result), flush=True)
+            if name == "down":
+                begun, ended = result.down_mb
+                print(
+                    f"Robot's memory: {result.resident_mb[0]:.1f} MB, {begun:.1f} before and {ended:.1f} after the outage."
+                )
             if name == "late":
                 print(cloud_line(folder / "robot.log"), flush=True)
     return 0

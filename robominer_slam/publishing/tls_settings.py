@@ -14,6 +14,12 @@ REMOTE_BYTES = {"status": REMOTE_STATUS_BYTES, "map/updates": MAX_MESSAGE_BYTES}
 REMOTE_ROS_HZ = {"pose": 1.0, "odom": 0.1, "tf": 0.1, "path": 0.1, "whiskers/points": 0.1}
 #: And the largest of them: 500 poses of a path would take a slow link for some seconds. Its keyframes are in the map.
 REMOTE_ROS_BYTES = {"path": MAX_MESSAGE_BYTES}
+#: A radio that is gone is noticed after 5 s instead of 10: what waits in TLS and TCP meanwhile comes late, all of it. An
+#: outage of 2 s, with TCP's pause after it, is survived. Who connects tries again soon.
+_SLOW_LINK: dict[str, object] = {
+    "transport/link/tx/lease": 5000,
+    "connect/retry": {"period_init_ms": 500, "period_max_ms": 1000, "period_increase_factor": 2},
+}
 #: `status` goes out in full and then, at once, in short. The full one is too large for TLS links; on the others the
 #: short one comes too soon after it. Full ones are a second apart.
 _LOCAL_STATUS_HZ = 2.0
@@ -38,7 +44,7 @@ def tls(credentials: Credentials, *, serves: bool) -> dict[str, object]:
     if serves:
         values["listen_certificate"] = str(credentials.certificate)
         values["listen_private_key"] = str(credentials.key)
-    return {f"transport/link/tls/{key}": value for key, value in values.items()}
+    return {**_SLOW_LINK, **{f"transport/link/tls/{key}": value for key, value in values.items()}}
 
 
 def remote_rates(prefix: str, *, remote_ros: bool) -> dict[str, object]:
