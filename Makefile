@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types bench fuzz soak recordings clean venv
+.PHONY: demo test lint types bench fuzz soak remote-link recordings clean venv
 .DEFAULT_GOAL := help
 
 help:
@@ -11,6 +11,7 @@ help:
 	@echo "make test    lint, types and tests, under eight minutes"
 	@echo "make bench   accuracy and speed tables (long)"
 	@echo "make soak    a device unplugged and replugged 200 times, two minutes"
+	@echo "make remote-link  robot and operator over 64 kbit/s with outages, as root, half an hour"
 	@echo "make fuzz    ten million bytes of noise and damage for each decoder"
 	@echo "make recordings   the five scenarios as recordings, some minutes"
 
@@ -45,6 +46,9 @@ bench: $(VENV)/.dev
 
 soak: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.soak_hotplug
+
+remote-link: $(VENV)/.dev
+	$(BIN)/python -m benchmarks.remote_link --outages 50
 
 fuzz: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.fuzz_decoders

@@ -4,7 +4,8 @@
 
 Makes network namespaces with a rate limit between them and sets the link down and up: needs root and iproute2, and ends
 with 2 where it cannot. The robot has TLS with keys of its own. By default it is `benchmarks.link_robot`, which has no
-SLAM; with a recording, `drive`, `outages` and `down` are the daemon itself, with the recording's devices served in real time.
+SLAM; with a recording, `drive`, `outages` and `down` are the daemon itself, and the recording's devices are served in
+real time.
 
     drive    nothing fails: kbit/s on the wire, bytes by topic
     outages  2 s without link in each minute, and a correction of the whole map now and then
@@ -137,9 +138,7 @@ def main() -> int:
             print(topics(result), flush=True)
             if name == "down":
                 begun, ended = result.down_mb
-                print(
-                    f"Robot's memory: {result.resident_mb[0]:.1f} MB, {begun:.1f} before and {ended:.1f} after the outage."
-                )
+                print(f"Robot's memory, MB: {begun:.1f} before and {ended:.1f} after the outage.")
             if name == "late":
                 print(cloud_line(folder / "robot.log"), flush=True)
     return 0

@@ -14,7 +14,7 @@ REMOTE_BYTES = {"status": REMOTE_STATUS_BYTES, "map/updates": MAX_MESSAGE_BYTES}
 REMOTE_ROS_HZ = {"pose": 1.0, "odom": 0.1, "tf": 0.1, "path": 0.1, "whiskers/points": 0.1}
 #: And the largest of them: 500 poses of a path would take a slow link for some seconds. Its keyframes are in the map.
 REMOTE_ROS_BYTES = {"path": MAX_MESSAGE_BYTES}
-#: A radio that is gone is noticed after 5 s instead of 10: what waits in TLS and TCP meanwhile comes late, all of it. An
+#: A radio that is gone is noticed after 5 s instead of 10: all that waits in TLS and TCP meanwhile comes late. An
 #: outage of 2 s, with TCP's pause after it, is survived. Who connects tries again soon.
 _SLOW_LINK: dict[str, object] = {
     "transport/link/tx/lease": 5000,

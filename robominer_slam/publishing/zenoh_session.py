@@ -11,6 +11,7 @@ from typing import TypeAlias
 import zenoh
 from zenoh import ext
 
+from robominer_slam.publishing import asking
 from robominer_slam.publishing.bus_messages import Query, QueryError, QueryRefusedError, Received, Reply, parameters_of
 from robominer_slam.publishing.keys import Qos, encoding_of, qos_of, qos_of_query
 from robominer_slam.publishing.senders import Peer, own_source, sender
@@ -97,14 +98,7 @@ class ZenohBus:
 
     def answered(self, key: str, timeout_s: float) -> bool:
         """Whether somebody answers queries of a key, and shows it to us; nothing is asked."""
-        known = threading.Event()
-        with self._session.declare_querier(self._full(key)) as querier:
-            listener = querier.declare_matching_listener(lambda status: known.set() if status.matching else None)
-            # Zenoh's stubs leave this method without a return type.
-            end_listening: Callable[[], None] = listener.undeclare
-            found = bool(getattr(querier.matching_status, "matching", False)) or known.wait(timeout_s)
-            end_listening()
-        return found
+        return asking.answered(self._session, self._full(key), timeout_s)
 
     def put(
         self,
@@ -217,29 +211,10 @@ class ZenohBus:
         Raises:
             QueryError: nobody answered in time, or with errors only.
         """
-        text = ";".join(f"{name}={value}" for name, value in (parameters or {}).items())
-        selector = self._full(key) + (f"?{text}" if text else "")
-        # Several answers on one key are parts of one answer, not versions of it: keep all.
-        replies = self._session.get(
-            selector,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=timeout_s,
-            payload=payload,
-            priority=qos_of_query(key).priority,
-            congestion_control=qos_of_query(key).congestion,
-            source_info=own_source(self._session, self._full(key)) if key.startswith("cmd/") else None,
-        )
-        received: list[Received] = []
-        errors: list[str] = []
-        for reply in replies:
-            if reply.ok is not None:
-                received.append(self._received(reply.ok))
-            elif reply.err is not None:
-                errors.append(reply.err.payload.to_bytes().decode("utf-8", "replace"))
-        if received:
-            return received
-        reason = "; ".join(errors) or "no answer; is the robot's program running?"
-        raise QueryError(f"{self._full(key)}: {reason}")
+        selector = asking.selector(self._full(key), parameters or {})
+        source = own_source(self._session, self._full(key)) if key.startswith("cmd/") else None
+        found = asking.wait(self._session, selector, qos_of_query(key), timeout_s, payload, source)
+        return [self._received(sample) for sample in found]
 
     def ask(
         self,
@@ -258,32 +233,14 @@ class ZenohBus:
             on_end: called once, when no more will come, whether any came or not.
             timeout_s: after this long no more will come.
         """
-
-        def take(reply: zenoh.Reply) -> None:
-            try:
-                if reply.ok is not None:
-                    on_reply(self._received(reply.ok))
-                elif reply.err is not None:
-                    # Zenoh's own time-out comes as an error, too, and is common on a link that breaks.
-                    log.info("%s: no answer: %s", key, reply.err.payload.to_bytes().decode("utf-8", "replace"))
-            # Whatever it is must not end Zenoh's thread, and must be seen.
-            except Exception:
-                log.exception("an answer on %s could not be taken", key)
-
-        def end() -> None:
-            try:
-                on_end()
-            except Exception:
-                log.exception("the end of an answer on %s could not be taken", key)
-
-        text = ";".join(f"{name}={value}" for name, value in parameters.items())
-        self._session.get(
-            self._full(key) + (f"?{text}" if text else ""),
-            zenoh.handlers.Callback(take, end),
-            consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=timeout_s,
-            priority=qos_of_query(key).priority,
-            congestion_control=qos_of_query(key).congestion,
+        selector = asking.selector(self._full(key), parameters)
+        asking.start(
+            self._session,
+            selector,
+            qos_of_query(key),
+            timeout_s,
+            lambda sample: on_reply(self._received(sample)),
+            on_end,
         )
 
     def _answer(self, query: zenoh.Query, key: str, callback: Callable[[Query], Reply | Iterable[Reply]]) -> None:
