@@ -156,16 +156,17 @@ def summary(lines: list[dict[str, Any]], begun: float, returns: list[float]) -> 
     result.joined_s = next((line["t"] - begun for line in states if line["synchronised"]), None)
     for index, back in enumerate(returns):
         end = returns[index + 1] if index + 1 < len(returns) else float("inf")
-        heard = next((line["t"] for line in poses if back < line["t"] - line["late"] and line["t"] < end), None)
-        if heard is None:
-            continue
-        result.heard_s.append(heard - back)
-        equal = next((line["t"] for line in states if heard < line["t"] < end and line["synchronised"]), None)
+        new = [line for line in poses if back < line["t"] - line["late"] and line["t"] < end]
+        if new:
+            result.heard_s.append(new[0]["t"] - back)
+        # What the robot's map is, telemetry tells; before, the copy is equal only to what the map was.
+        told = next((line["t"] for line in new if line["key"] == "telemetry"), end)
+        equal = next((line["t"] for line in states if told < line["t"] < end and line["synchronised"]), None)
         if equal is not None:
             result.equal_s.append(equal - back)
-    told = {line["robot_version"]: line["robot_digest"] for line in received if "robot_version" in line}
+    digests = {line["robot_version"]: line["robot_digest"] for line in received if "robot_version" in line}
     last = states[-1] if states else {"version": 0, "digest": None, "counters": {}}
-    result.equal = last["digest"] is not None and told.get(str(last["version"])) == last["digest"]
+    result.equal = last["digest"] is not None and digests.get(str(last["version"])) == last["digest"]
     result.map_bytes = int(last["counters"].get("reply_bytes", 0))
     return result
 

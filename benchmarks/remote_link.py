@@ -36,7 +36,7 @@ AWAY_S, DOWN_S = 60.0, 120.0
 POINT_BYTES = 12
 HEAD = (
     f"{'run':<8} {'pose late s: median':>20} {'95 %':>6} {'max':>6} {'kbit/s':>7} {'up':>5} {'joined s':>9} "
-    f"{'outages':>8} {'first pose s':>13} {'map equal s: median':>20} {'max':>6} {'digest':>8} {'RSS MB':>14}"
+    f"{'returns':>8} {'first pose s':>13} {'map equal s: median':>20} {'max':>6} {'digest':>8} {'RSS MB':>14}"
 )
 
 
