@@ -1,7 +1,7 @@
 """The link to a live robot: subscriptions and queries over Zenoh fill a `RobotView`. Knows nothing of the page.
 
-Zenoh brings a lost link back by itself; what was missed is had again by the map's snapshot, and the robot's next
-messages. A thread, `operator-link`, asks for what has to be asked for: the array's mounts, the map's snapshot, the
+Zenoh brings a lost link back by itself; what was missed of the map is fetched (`MapReceiver`), the rest comes with the
+robot's next messages. A thread, `operator-link`, asks for what has to be asked for: the array's mounts, the map, the
 loop closures, and whether the robot is simulated and takes waypoints.
 """
 
@@ -21,7 +21,7 @@ from robominer_slam.operator.commands import CommandResult, Outcome, result_of
 from robominer_slam.operator.robot_view import RobotView
 from robominer_slam.publishing import telemetry
 from robominer_slam.publishing.bus_messages import QueryError, Received
-from robominer_slam.publishing.map_stream import MapStreamDecoder
+from robominer_slam.publishing.map_receiver import MapReceiver
 from robominer_slam.publishing.zenoh_session import ZenohBus, ZenohSettings
 
 log = logging.getLogger(__name__)
@@ -39,7 +39,7 @@ SIMULATOR_INTERVAL_S = 3.0
 
 #: Keys that tell where the robot is.
 LIVE_KEYS = frozenset({"pose", "telemetry"})
-KEYS = ("pose", "telemetry", "status", "whiskers/points")
+KEYS = ("pose", "telemetry", "status", "whiskers/points", "map/updates")
 
 
 class RobotLink:
@@ -63,23 +63,22 @@ class RobotLink:
         """
         self.view = view or RobotView()
         self.robot = robot
-        self._decoder = MapStreamDecoder()
-        self._decoder_lock = threading.Lock()
         self._taps: list[Callable[[Received], None]] = []
         self._stop = threading.Event()
         self._due: dict[str, float] = {}
         self._mounts_known = False
         self._graph_of: tuple[int, int] | None = None
         self._bus = ZenohBus(settings, f"robominer/{robot}")
+        self._receiver = MapReceiver(self._bus, self.view.take_map)
         handlers = {
             "pose": self._on_pose,
             "telemetry": self._on_telemetry,
             "status": self._on_status,
             "whiskers/points": self._on_points,
+            "map/updates": self._receiver.take,
         }
         for key in KEYS:
             self._bus.subscriber(key, self._counted(handlers[key]))
-        self._bus.subscriber("map/updates", self._counted(self._on_map), history=True)
         self._thread = threading.Thread(target=self._ask_again, name="operator-link", daemon=True)
         self._thread.start()
 
@@ -148,9 +147,12 @@ class RobotLink:
         self.view.take_pose(*live_frame.pose_of(received.payload))
 
     def _on_telemetry(self, received: Received) -> None:
-        self.view.take_telemetry(telemetry.decode(received.payload))
+        message = telemetry.decode(received.payload)
+        self._receiver.heard(message.map_version)
+        self.view.take_telemetry(message)
 
     def _on_status(self, received: Received) -> None:
+        self._receiver.take(received)
         self.view.take_status(status_entries.entries_of(received.payload))
 
     def _on_points(self, received: Received) -> None:
@@ -158,25 +160,14 @@ class RobotLink:
         if layout is not None:
             self.view.take_angles(*live_frame.contacts_of(received.payload, layout.count))
 
-    def _on_map(self, received: Received) -> None:
-        self._feed(received.payload)
-
-    def _feed(self, payload: bytes) -> None:
-        with self._decoder_lock:
-            changed = self._decoder.feed(payload)
-            state = self._decoder.state
-        if changed and state is not None:
-            self.view.take_map(state)
-
     def _ask_again(self) -> None:
         while not self._stop.wait(TICK_S):
             heard = self.view.telemetry
             if heard is None and self.view.live is None:
                 continue
+            self._receiver.tick()
             if not self._mounts_known:
                 self._try("mounts", RETRY_S, self._ask_mounts)
-            if self._decoder.needs_snapshot or self._decoder.state is None:
-                self._try("snapshot", RETRY_S, self._ask_snapshot)
             if heard is not None and self._graph_wanted(heard.closures):
                 self._try("graph", GRAPH_INTERVAL_S, self._ask_graph)
             self._try("simulator", SIMULATOR_INTERVAL_S, self._ask_simulator)
@@ -200,12 +191,6 @@ class RobotLink:
         if layout is not None:
             self._mounts_known = True
             self.view.take_layout(layout)
-
-    def _ask_snapshot(self) -> None:
-        with self._decoder_lock:
-            copy = {name: str(value) for name, value in self._decoder.copy.items()}
-        for reply in self._bus.get("map/snapshot", copy, timeout_s=QUERY_TIMEOUT_S):
-            self._feed(reply.payload)
 
     def _graph_wanted(self, closures: int) -> bool:
         return self._graph_of != (self.view.map.map_id, closures)

@@ -75,7 +75,7 @@ class MapReceiver:
 
         Args:
             bus: to ask on.
-            on_change: called with each new state, in the thread that brought it; a later one may overtake it.
+            on_change: called with each new state, in the thread that brought it, one after the other.
             clock: monotonic time, s.
         """
         self.counters = Counters()
@@ -83,6 +83,8 @@ class MapReceiver:
         self._on_change = on_change
         self._clock = clock
         self._lock = threading.Lock()
+        #: Held from taking a message until the owner has the state that came of it, so that none overtakes another.
+        self._feeding = threading.Lock()
         self._decoder = MapStreamDecoder()
         self._heard_version: int | None = None
         self._heard_digest: tuple[int, str] | None = None
@@ -246,12 +248,13 @@ class MapReceiver:
         self._fetching = None
 
     def _feed(self, payload: bytes, counter: str) -> None:
-        with self._lock:
-            self._alive()
-            self.counters[counter] += len(payload)
-            changed = self._decoder.feed(payload)
-            state = self._decoder.state
-            if changed:
-                self._behind_s = self._clock()
-        if changed and state is not None and self._on_change is not None:
-            self._on_change(state)
+        with self._feeding:
+            with self._lock:
+                self._alive()
+                self.counters[counter] += len(payload)
+                changed = self._decoder.feed(payload)
+                state = self._decoder.state
+                if changed:
+                    self._behind_s = self._clock()
+            if changed and state is not None and self._on_change is not None:
+                self._on_change(state)
