@@ -198,9 +198,10 @@ class RobotLink:
     def _ask_graph(self) -> None:
         heard = self.view.telemetry
         asked = (self.view.map.map_id, 0 if heard is None else heard.closures)
+        # One that is too large for a remote link does not come, and is not asked for again until it has changed.
+        self._graph_of = asked
         edges = json.loads(self.graph())["edges"]
         self.view.take_closures([(edge["i"], edge["j"]) for edge in edges if edge["kind"] == "loop"])
-        self._graph_of = asked
 
     def _ask_simulator(self) -> None:
         try:

@@ -14,6 +14,10 @@ REMOTE_BYTES = {"status": REMOTE_STATUS_BYTES, "map/updates": MAX_MESSAGE_BYTES}
 REMOTE_ROS_HZ = {"pose": 1.0, "odom": 0.1, "tf": 0.1, "path": 0.1, "whiskers/points": 0.1}
 #: And the largest of them: 500 poses of a path would take a slow link for some seconds. Its keyframes are in the map.
 REMOTE_ROS_BYTES = {"path": MAX_MESSAGE_BYTES}
+#: An answer that takes a slow link longer than 5 s ends it, as Zenoh closes what has been blocked for so long, and
+#: poses wait behind it: these answers have no portions, and are not carried at all where they are larger, bytes.
+REMOTE_ANSWER_BYTES = 16 * 1024
+WHOLE_ANSWERS = ("map/cloud", "map/grid", "map/graph")
 #: A radio that is gone is noticed after 5 s instead of 10: all that waits in TLS and TCP meanwhile comes late. An
 #: outage of 2 s, with TCP's pause after it, is survived. Who connects tries again soon.
 _SLOW_LINK: dict[str, object] = {
@@ -66,14 +70,19 @@ def remote_rates(prefix: str, *, remote_ros: bool) -> dict[str, object]:
     if not remote_ros:
         rules = [{"key_expr": f"{prefix}/{key}", "freq": rate} for key, rate in REMOTE_ROS_HZ.items()]
         downsampling.append({"flows": ["egress"], "messages": ["put"], "link_protocols": ["tls"], "rules": rules})
-    too_large = [
-        {
-            "flows": ["egress"],
-            "messages": ["put"],
-            "link_protocols": ["tls"],
-            "key_exprs": [f"{prefix}/{key}"],
-            "size_limit": limit,
-        }
-        for key, limit in (REMOTE_BYTES if remote_ros else REMOTE_BYTES | REMOTE_ROS_BYTES).items()
-    ]
+    too_large = [_too_large("put", [f"{prefix}/{key}"], limit) for key, limit in REMOTE_BYTES.items()]
+    if not remote_ros:
+        too_large += [_too_large("put", [f"{prefix}/{key}"], limit) for key, limit in REMOTE_ROS_BYTES.items()]
+        too_large.append(_too_large("reply", [f"{prefix}/{key}" for key in WHOLE_ANSWERS], REMOTE_ANSWER_BYTES))
     return {"downsampling": downsampling, "low_pass_filter": too_large}
+
+
+def _too_large(kind: str, keys: list[str], limit: int) -> dict[str, object]:
+    """A rule that keeps what is larger from TLS links."""
+    return {
+        "flows": ["egress"],
+        "messages": [kind],
+        "link_protocols": ["tls"],
+        "key_exprs": keys,
+        "size_limit": limit,
+    }
