@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -49,7 +50,8 @@ def serve(configuration: Configuration, config_file: Path, stop: threading.Event
     with contextlib.ExitStack() as stack:
         if robot.role == "drivers":
             reader = SerialReader(device_settings(configuration))
-            bus = stack.enter_context(ZenohBus(settings, prefix))
+            # The board with the SLAM is the one that ROS sees: all topics are its own.
+            bus = stack.enter_context(ZenohBus(replace(settings, ros=None), prefix))
             forward(stack.enter_context(reader), bus, stop)
             return
         array = calibrated_array(configuration, folder)

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from robominer_slam.configuration.model import ZenohSection
+from robominer_slam.configuration.zenoh_section import ZenohSection
 from robominer_slam.publishing.bus_messages import Received
 from robominer_slam.publishing.client_settings import client_settings
 from robominer_slam.publishing.robot_settings import robot_settings
