@@ -7,11 +7,13 @@ from the bridge's own source (liveliness_mgt.rs, `parse_ke_liveliness_pub`).
 
 from __future__ import annotations
 
+import json
 import os
 import queue
 import struct
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -23,6 +25,7 @@ import zenoh
 from mcap_ros2._dynamic import generate_dynamic
 from rosbags.typesys import Stores, get_typestore
 
+from drivers.ros_definitions import DEFINITIONS
 from drivers.ros_messages import schema_text
 from robominer_slam.configuration.file import ConfigurationError, parse
 from robominer_slam.publishing import cloud_messages, pose_messages, report_messages
@@ -103,9 +106,7 @@ class Node:
     def subscribe_latched(self, key: str) -> None:
         """As rmw_zenoh and the bridge subscribe to TRANSIENT_LOCAL topics."""
         history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
-        self._declared.append(
-            zenoh.ext.declare_advanced_subscriber(self.session, key, self.take, history=history)
-        )
+        self._declared.append(zenoh.ext.declare_advanced_subscriber(self.session, key, self.take, history=history))
 
     def hear(self, keys: set[str], again: Callable[[], None]) -> dict[str, Heard]:
         """One message of each key; what is published may come before the subscription is known, so `again`."""
@@ -161,6 +162,11 @@ def rmw_zenoh() -> Iterator[Robot]:
 @pytest.fixture
 def ros2dds() -> Iterator[Robot]:
     yield from robot_shown_to(RosSettings("ros2dds"))
+
+
+@pytest.fixture
+def plain() -> Iterator[Robot]:
+    yield from robot_shown_to(None)
 
 
 def check_decoded(topic: str, payload: bytes) -> None:
@@ -277,10 +283,6 @@ session.session.close()
 
 
 def test_a_foreign_library_lists_the_topics_and_reads_them(rmw_zenoh: Robot, tmp_path: Path) -> None:
-    import json
-
-    from drivers.ros_definitions import DEFINITIONS
-
     topic = "/robominer/rm3/pose"
     arguments = [str(rmw_zenoh.port), str(DOMAIN), topic, TOPICS[topic], str(len(TOPICS))]
     environment = {**os.environ, "HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path)}
@@ -295,8 +297,6 @@ def test_a_foreign_library_lists_the_topics_and_reads_them(rmw_zenoh: Robot, tmp
             process.stdin.write(json.dumps(DEFINITIONS) + "\n")
             process.stdin.flush()
             lines: queue.Queue[str] = queue.Queue()
-            import threading
-
             threading.Thread(target=lambda: lines.put(process.stdout.readline()), daemon=True).start()
             end = time.monotonic() + 2 * LIMIT_S
             while lines.empty() and time.monotonic() < end:
@@ -305,7 +305,7 @@ def test_a_foreign_library_lists_the_topics_and_reads_them(rmw_zenoh: Robot, tmp
             read = json.loads(lines.get(timeout=1.0))
         finally:
             process.kill()
-    assert {name: types for name, types in seen["listed"]} == {name: [kind] for name, kind in TOPICS.items()}
+    assert dict(seen["listed"]) == {name: [kind] for name, kind in TOPICS.items()}
     store = get_typestore(Stores.ROS2_JAZZY)
     for name, kind in TOPICS.items():
         quality = ":1:,1:,:,:,," if name == "/tf_static" else "::,10:,:,:,,"
@@ -372,18 +372,18 @@ def test_tokens_go_when_the_robot_goes(rmw_zenoh: Robot) -> None:
     watcher.undeclare()
 
 
-def test_without_ros_there_is_nothing_of_it() -> None:
-    for bus, node, _ in robot_shown_to(None):
-        node.subscribe("tf", f"{PREFIX}/tf", "*/robominer/**")
-        heard = node.hear({f"{PREFIX}/tf"}, lambda: publish(bus))
-        assert set(heard) == {f"{PREFIX}/tf"}
-        assert node.tokens("@ros2_lv/**", 0) == []
-        assert node.tokens("@/*/@ros2_lv/**", 0) == []
+def test_without_ros_there_is_nothing_of_it(plain: Robot) -> None:
+    bus, node, _ = plain
+    node.subscribe("tf", f"{PREFIX}/tf", "*/robominer/**")
+    heard = node.hear({f"{PREFIX}/tf"}, lambda: publish(bus))
+    assert set(heard) == {f"{PREFIX}/tf"}
+    assert node.tokens("@ros2_lv/**", 0) == []
+    assert node.tokens("@/*/@ros2_lv/**", 0) == []
 
 
 @pytest.mark.parametrize("name", ["front-1", "2nd", "a__b"])
 def test_a_robots_id_that_ros_cannot_say_is_refused(name: str) -> None:
-    with pytest.raises(ConfigurationError, match="a robot.id that ROS takes for a name") as caught:
+    with pytest.raises(ConfigurationError, match=r"a robot\.id that ROS takes for a name") as caught:
         parse(f'[robot]\nid = "{name}"\n[zenoh]\nros = "ros2dds"\n', "file.toml")
     assert "\n" not in str(caught.value)
     assert parse(f'[robot]\nid = "{name}"\n', "file.toml").robot.id == name
