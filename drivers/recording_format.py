@@ -32,6 +32,21 @@ class RecordingError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
+class ForeignFormat:
+    """A format of messages that are none of ROS's.
+
+    Attributes:
+        name: as the schema's.
+        encoding: as the schema's and the messages'; readers that do not know it leave the messages alone.
+        description: in words, and where to read more; stands in the place of a definition.
+    """
+
+    name: str
+    encoding: str
+    description: str
+
+
+@dataclass(frozen=True, slots=True)
 class TopicMeaning:
     """A role that a topic can play.
 

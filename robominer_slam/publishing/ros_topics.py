@@ -66,12 +66,18 @@ class RosLayout(Protocol):
         ...
 
 
+def ros_name(prefix: str, key: str) -> str:
+    """What ROS calls a key under the robot's prefix."""
+    return f"/{key}" if key in _GLOBAL else f"/{prefix}/{key}"
+
+
 def topics_under(prefix: str) -> tuple[RosTopic, ...]:
     """The topics of a robot with this prefix, `robominer/<id>`."""
     found = []
     for key in ROS_KEYS:
         typename = encoding_of(key).partition(";")[2]
         latched = qos_of(key).cache > 0
-        name = f"/{key}" if key in _GLOBAL else f"/{prefix}/{key}"
-        found.append(RosTopic(key, name, typename, type_hash(typename), latched, 1 if latched else DEPTH))
+        found.append(
+            RosTopic(key, ros_name(prefix, key), typename, type_hash(typename), latched, 1 if latched else DEPTH)
+        )
     return tuple(found)
