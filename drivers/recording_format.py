@@ -37,8 +37,8 @@ class ForeignFormat:
 
     Attributes:
         name: as the schema's.
-        encoding: as the schema's and the messages'; readers that do not know it leave the messages alone.
-        description: in words, and where to read more; stands in the place of a definition.
+        encoding: of the messages; readers that do not know it leave them alone.
+        description: in words, and where to read more.
     """
 
     name: str

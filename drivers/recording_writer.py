@@ -137,7 +137,7 @@ class RecordingWriter:
     def write_foreign(
         self, topic: str, form: ForeignFormat, data: bytes, log_time_ns: int, publish_time_ns: int | None = None
     ) -> None:
-        """Write a message that is none of ROS's, with words on its format in the place of a definition.
+        """Write a message that is none of ROS's, with words on its format in the channel's metadata.
 
         Raises:
             RecordingError: the file cannot be written.
@@ -249,9 +249,13 @@ class RecordingWriter:
     def _foreign_channel(self, topic: str, form: ForeignFormat) -> int:
         channel = self._channels.get((topic, form.name))
         if channel is None:
-            schema = self._writer.register_schema(
-                name=form.name, encoding=form.encoding, data=form.description.encode()
+            # With a name, but no definition: readers stumble over definitions in a language that they do not know.
+            schema = self._writer.register_schema(name=form.name, encoding="", data=b"")
+            channel = self._writer.register_channel(
+                topic=topic,
+                message_encoding=form.encoding,
+                schema_id=schema,
+                metadata={"format": form.description},
             )
-            channel = self._writer.register_channel(topic=topic, message_encoding=form.encoding, schema_id=schema)
             self._channels[topic, form.name] = channel
         return channel

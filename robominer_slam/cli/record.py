@@ -13,19 +13,11 @@ import click
 
 from drivers.recording_format import RecordingError
 from drivers.recording_writer import RecordingWriter
-from drivers.serial_reader import SerialReader
-from robominer_slam.configuration.devices import device_settings
-from robominer_slam.configuration.file import ConfigurationError, load
-from robominer_slam.configuration.model import Configuration
 from robominer_slam.publishing.client_settings import client_settings
-from robominer_slam.publishing.zenoh_session import ZenohBus, ZenohSetupError
+from robominer_slam.publishing.zenoh_session import ZenohBus
 from robominer_slam.recording.link_recorder import CHUNK_BYTES, LinkRecorder
-from robominer_slam.recording.raw_recorder import RawRecorder, attachments
 from robominer_slam.recording.session import Recorder, RecordingSummary
 from robominer_slam.recording.session import record as run_recording
-from robominer_slam.security.endpoints import is_tls
-from robominer_slam.sources.zenoh_source import ZenohSource
-from robominer_slam.wall_clock import WallClock
 
 log = logging.getLogger(__name__)
 
@@ -33,8 +25,6 @@ FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 OUT = click.Path(dir_okay=False, path_type=Path)
 FOLDER = click.Path(file_okay=False, path_type=Path)
 CONNECT_TIMEOUT_S = 5.0
-#: A daemon on this machine answers at once, or is not there.
-LOCAL_TIMEOUT_S = 1.0
 
 
 @click.command(
@@ -73,51 +63,28 @@ def record(
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
     with contextlib.ExitStack() as stack:
-        recorder: Recorder
         if config_file is not None:
-            configuration = load(config_file)
-            # Before the devices are touched: a mistake in the files is found at once.
-            content = attachments(configuration, config_file)
-            writer = RecordingWriter(out, attachments=content)
-            recorder = raw = _raw(configuration, writer, stack)
-            summary = _run(recorder, writer, stop, max_time)
-            for device in raw.faults():
+            # Imported here: who records a link needs none of what the robot's side takes seconds to load.
+            from robominer_slam.recording.raw_session import raw_recorder
+
+            raw = stack.enter_context(raw_recorder(config_file, out))
+            summary = _run(raw.recorder, raw.writer, stop, max_time)
+            for device in raw.recorder.faults():
                 log.warning("device %s: %s", device.name, device.fault or device.state)
             nothing = "no device has sent anything"
         else:
             settings = client_settings(str(connect), credentials, CONNECT_TIMEOUT_S)
             bus = stack.enter_context(ZenohBus(settings, f"robominer/{robot}"))
             writer = RecordingWriter(out, chunk_bytes=CHUNK_BYTES, metadata={"robot": robot, "link": str(connect)})
-            recorder = LinkRecorder(bus, writer)
-            summary = _run(recorder, writer, stop, max_time)
+            summary = _run(LinkRecorder(bus, writer), writer, stop, max_time)
             nothing = (
                 f"nothing came from robominer/{robot}: is the robot's id right, and is your name on its access list?"
             )
-    _tell(summary, as_json)
     if not summary.messages:
-        raise click.ClickException(f"{out} is empty: {nothing}")
-
-
-def _raw(configuration: Configuration, writer: RecordingWriter, stack: contextlib.ExitStack) -> RawRecorder:
-    bus = _local_daemon(configuration)
-    if bus is not None:
-        log.info("recording what the daemon's devices measure")
-        stack.enter_context(bus)
-        return RawRecorder(stack.enter_context(ZenohSource(bus, WallClock())), writer)
-    if not configuration.device:
-        raise ConfigurationError("device: missing, and no daemon runs here; expected a [[device]] for each port")
-    log.info("recording %d devices", len(configuration.device))
-    return RawRecorder(stack.enter_context(SerialReader(device_settings(configuration))), writer)
-
-
-def _local_daemon(configuration: Configuration) -> ZenohBus | None:
-    """A client of the daemon of this configuration, if it runs on this machine."""
-    for endpoint in configuration.zenoh.listen:
-        if not is_tls(endpoint):
-            with contextlib.suppress(ZenohSetupError):
-                settings = client_settings(endpoint, None, LOCAL_TIMEOUT_S)
-                return ZenohBus(settings, f"robominer/{configuration.robot.id}")
-    return None
+        if out.is_file():
+            out.unlink()
+        raise click.ClickException(f"{out} not written: {nothing}")
+    _tell(summary, as_json)
 
 
 def _run(
