@@ -16,6 +16,8 @@ log = logging.getLogger(__name__)
 
 #: A snapshot that did not come is asked for again after this long, s: it may be large, and the link slow.
 RETRY_S = 5.0
+#: It goes into a file or to a program on this machine: far more than Zenoh would carry in a message.
+MAX_POINTS = 500_000
 MAP = "map"
 
 
@@ -72,4 +74,4 @@ class MapFollower:
         if state is None or (state.map_id, state.version) == self._shown:
             return None
         self._shown = state.map_id, state.version
-        return cloud_messages.map_cloud(stamp_ns, MAP, state.cloud())
+        return cloud_messages.map_cloud(stamp_ns, MAP, state.cloud(), MAX_POINTS)
