@@ -11,14 +11,17 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
+import click
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from mcap_ros2._dynamic import generate_dynamic
 from websockets.sync.client import ClientConnection
 from websockets.sync.client import connect as connect_to
 from websockets.typing import Subprotocol
 
 from drivers.ros_messages import deserialize
+from robominer_slam.cli.foxglove_option import foxglove_option, show_in_foxglove
 from robominer_slam.configuration.file import ConfigurationError
 from robominer_slam.operator import foxglove_telemetry
 from robominer_slam.operator.foxglove_bridge import FoxgloveBridge, serve_foxglove
@@ -215,7 +218,7 @@ def test_it_ends_when_it_is_told_to(sessions: tuple[ZenohBus, ZenohBus]) -> None
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.7.2", "robot.local"])
 def test_it_serves_this_machine_only(sessions: tuple[ZenohBus, ZenohBus], host: str) -> None:
     with pytest.raises(ConfigurationError, match="anybody there could look"):
-        FoxgloveBridge(sessions[1], host, 0)
+        FoxgloveBridge(sessions[1], 0, host)
 
 
 def test_a_port_that_is_taken_is_one_line(sessions: tuple[ZenohBus, ZenohBus]) -> None:
@@ -224,3 +227,26 @@ def test_a_port_that_is_taken_is_one_line(sessions: tuple[ZenohBus, ZenohBus]) -
         with pytest.raises(ConfigurationError, match=f"Foxglove on 127.0.0.1:{port}: Failed to bind") as caught:
             FoxgloveBridge(sessions[1], port=port)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [([], ""), (["--foxglove"], "ws://127.0.0.1:8765"), (["--foxglove", "0"], "ws://127.0.0.1:")],
+)
+def test_a_command_is_hooked_in_with_one_option(
+    sessions: tuple[ZenohBus, ZenohBus], arguments: list[str], said: str
+) -> None:
+    @click.command()
+    @foxglove_option
+    def operator(foxglove_port: int | None) -> None:
+        with contextlib.ExitStack() as stack:
+            try:
+                show_in_foxglove(stack, sessions[1], foxglove_port)
+            except ConfigurationError as error:
+                # Where a viewer's server runs on this machine already.
+                click.echo(f"ws://{str(error).split()[2]}")
+
+    result = CliRunner().invoke(operator, arguments)
+    assert result.exit_code == 0, result.output
+    assert said in result.output
+    assert bool(result.output) == bool(said)

@@ -18,13 +18,15 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
+from drivers.recording_writer import RecordingWriter
 from robominer_slam.publishing import telemetry
 from robominer_slam.publishing.map_stream import MapStreamDecoder
 from robominer_slam.publishing.zenoh_session import ZenohBus, ZenohSettings
+from robominer_slam.recording.link_recorder import LinkRecorder
 from sim_backend.demo import program
 from tests.shown_robot import PublishedRobot
 from tests.secured_robot import PREFIX, SecuredRobot, free_ports
-from tests.test_ros_bridge import STAMP_NS, TOPICS, check_decoded
+from tests.test_ros_bridge import MESSAGES, STAMP_NS, TOPICS, check_decoded
 
 LIMIT_S = 60.0
 TELEMETRY, UPDATES, SNAPSHOT = (f"/{PREFIX}/{key}" for key in ("telemetry", "map/updates", "map/snapshot"))
@@ -227,3 +229,26 @@ def test_what_cannot_be_is_one_line(
     assert len([line for line in done.stderr.splitlines() if "rror: " in line]) == 1
     assert (tmp_path / "there.mcap").read_bytes() == b"precious"
     assert [path.name for path in tmp_path.iterdir()] == ["there.mcap"]
+
+
+def test_a_message_that_nobody_knows_here_is_said_once_and_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    [port] = free_ports(1)
+    endpoint = f"tcp/127.0.0.1:{port}"
+    with (
+        ZenohBus(ZenohSettings(listen=(endpoint,)), PREFIX) as robot,
+        ZenohBus(ZenohSettings(connect=(endpoint,), mode="client"), PREFIX) as operator,
+        RecordingWriter(tmp_path / "seen.mcap") as writer,
+    ):
+        recorder = LinkRecorder(operator, writer)
+        end = time.monotonic() + LIMIT_S
+        while writer.counts.get(f"/{PREFIX}/pose", 0) < 3:
+            assert time.monotonic() < end
+            robot.put("odom", b"\0\1\0\0" + bytes(8), "application/cdr;strange_msgs/msg/Odometry")
+            robot.put("telemetry", b"\1")
+            robot.put("pose", MESSAGES["pose"])
+            recorder.step(0.05)
+        recorder.finish()
+    assert set(writer.counts) == {f"/{PREFIX}/pose", TELEMETRY}
+    assert caplog.text.count("strange_msgs/msg/Odometry") == 1

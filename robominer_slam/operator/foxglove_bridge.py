@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-HOST, PORT = "127.0.0.1", 8765
+HOST = "127.0.0.1"
 TICK_S = 0.2
 CLOUD_INTERVAL_S = 1.0
 GRID_INTERVAL_S = 2.0
@@ -55,13 +55,13 @@ class FoxgloveBridge:
         port: that it listens on.
     """
 
-    def __init__(self, bus: ZenohBus, host: str = HOST, port: int = PORT) -> None:
+    def __init__(self, bus: ZenohBus, port: int, host: str = HOST) -> None:
         """Begin to listen.
 
         Args:
             bus: a session that is open, and stays so for longer than this.
-            host: an address of this machine's own.
             port: 0 for any that is free.
+            host: an address of this machine's own.
 
         Raises:
             ConfigurationError: foxglove-sdk is missing, the address is not this machine's own, or the port is taken.
@@ -229,7 +229,7 @@ def serve_foxglove(
     Raises:
         ConfigurationError: as `FoxgloveBridge`.
     """
-    with FoxgloveBridge(bus, host, port) as bridge:
+    with FoxgloveBridge(bus, port, host) as bridge:
         on_ready(f"ws://{host}:{bridge.port}")
         stop.wait()
 

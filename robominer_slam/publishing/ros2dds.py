@@ -6,10 +6,10 @@ tokens: `@/<zid>/@ros2_lv` for a participant, and for each publisher
     @/<zid>/@ros2_lv/MP/<key>/<type>/<keyless>:<reliability>:<durability>:<history>,<depth>:<user data>
 
 with `/` written as U+00A7 within a part. The user data are those of the DDS writer that the bridge makes; since ROS
-Iron they carry the type's hash. Bridges older than that (pull request 349, December 2024) take no tokens with user data.
+Iron they carry the type's hash. Bridges from before December 2024 take no tokens with user data.
 
-Source: https://github.com/eclipse-zenoh/zenoh-plugin-ros2dds, zenoh-plugin-ros2dds/src/liveliness_mgt.rs (formats),
-route_subscriber.rs (messages; the history of latched topics), commits ef5b953 and ebdb1e0; pull request 349 (user data).
+Source: https://github.com/eclipse-zenoh/zenoh-plugin-ros2dds: liveliness_mgt.rs (formats; ef5b953), pull request 349
+(user data), route_subscriber.rs (messages, and the history of latched topics; ebdb1e0).
 """
 
 from __future__ import annotations

@@ -6,6 +6,7 @@ if the clocks agree. The map goes in as its stream, and now and then, and at the
 
 from __future__ import annotations
 
+import logging
 import queue
 import struct
 import time
@@ -13,6 +14,7 @@ from typing import NamedTuple
 
 from drivers.recording_format import ForeignFormat
 from drivers.recording_writer import RecordingWriter
+from drivers.ros_definitions import DEFINITIONS
 from drivers.ros_messages import CDR_LITTLE_ENDIAN, NANOSECONDS_PER_SECOND
 from robominer_slam.publishing.bus_messages import Received
 from robominer_slam.publishing.cloud_messages import POINT_CLOUD
@@ -21,6 +23,8 @@ from robominer_slam.publishing.map_follower import MapFollower
 from robominer_slam.publishing.pose_messages import TF_MESSAGE
 from robominer_slam.publishing.ros_topics import ROS_KEYS, ros_name
 from robominer_slam.publishing.zenoh_session import ZenohBus
+
+log = logging.getLogger(__name__)
 
 #: Small, as a slow link brings 2 KB a second and what is in a chunk is lost with the program.
 CHUNK_BYTES = 8 * 1024
@@ -68,6 +72,7 @@ class LinkRecorder:
         self._queue: queue.Queue[_Arrival] = queue.Queue(QUEUE_LENGTH)
         self._map = MapFollower(bus, self._on_snapshot)
         self._cloud_due_s = time.monotonic() + CLOUD_INTERVAL_S
+        self._unknown: set[str] = set()
         self.dropped = 0
         for key in KEYS:
             bus.subscriber(key, self._arrived, history=key in _WITH_HISTORY)
@@ -122,10 +127,13 @@ class LinkRecorder:
         topic = ros_name(self._bus.prefix, received.key)
         stamp_ns = stamp_of(received) or now_ns
         form = _FORMATS.get(received.encoding)
-        if form is None:
-            self._writer.write(topic, received.schema, received.payload, now_ns, stamp_ns)
-        else:
+        if form is not None:
             self._writer.write_foreign(topic, form, received.payload, now_ns, stamp_ns)
+        elif received.schema in DEFINITIONS:
+            self._writer.write(topic, received.schema, received.payload, now_ns, stamp_ns)
+        elif received.key not in self._unknown:
+            self._unknown.add(received.key)
+            log.warning("%s: not recorded: nothing is known here of %r", topic, received.encoding)
         if received.key == "map/updates":
             self._map.feed(received.payload)
 
