@@ -102,7 +102,9 @@ def test_a_viewer_sees_every_topic_with_its_definition(sessions: tuple[ZenohBus,
             assert {(c["encoding"], c["schemaEncoding"]) for c in viewer.channels.values()} == {("cdr", "ros2msg")}
             viewer.subscribe(*EXPECTED)
             seen: dict[str, bytes] = {}
+            end = time.monotonic() + LIMIT_S
             while seen.keys() != EXPECTED.keys():
+                assert time.monotonic() < end, EXPECTED.keys() - seen.keys()
                 topic, log_time, payload = viewer.next()
                 assert abs(log_time - time.time_ns()) < 60e9
                 seen[topic] = payload
@@ -163,7 +165,9 @@ def test_telemetry_stands_in_where_poses_come_seldom(sessions: tuple[ZenohBus, Z
             )
             viewer.subscribe(f"/{PREFIX}/pose", "/tf")
             found: dict[str, Any] = {}
+            end = time.monotonic() + LIMIT_S
             while len(found) < 2:
+                assert time.monotonic() < end, found.keys()
                 topic, _, payload = viewer.next()
                 message = viewer.decode(topic, payload)
                 if topic == "/tf" and len(message.transforms) < 2:

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader, make_reader
@@ -20,11 +21,12 @@ from rosbags.typesys import Stores, get_typestore
 
 from drivers.recording_writer import RecordingWriter
 from robominer_slam.publishing import telemetry
-from robominer_slam.publishing.map_stream import MapStreamDecoder
+from robominer_slam.publishing.bus_messages import Reply
+from robominer_slam.publishing.map_stream import MapStreamDecoder, MapStreamEncoder
 from robominer_slam.publishing.zenoh_session import ZenohBus, ZenohSettings
 from robominer_slam.recording.link_recorder import LinkRecorder
 from sim_backend.demo import program
-from tests.shown_robot import PublishedRobot
+from tests.shown_robot import Keyframe, PublishedRobot, telemetry_message
 from tests.secured_robot import PREFIX, SecuredRobot, free_ports
 from tests.test_ros_bridge import MESSAGES, STAMP_NS, TOPICS, check_decoded
 
@@ -252,3 +254,29 @@ def test_a_message_that_nobody_knows_here_is_said_once_and_left_out(
         recorder.finish()
     assert set(writer.counts) == {f"/{PREFIX}/pose", TELEMETRY}
     assert caplog.text.count("strange_msgs/msg/Odometry") == 1
+
+
+def test_the_map_of_before_is_asked_for(tmp_path: Path) -> None:
+    [port] = free_ports(1)
+    endpoint = f"tcp/127.0.0.1:{port}"
+    encoder = MapStreamEncoder(0x77)
+    encoder.update(1, [Keyframe(0, STAMP_NS, np.eye(3))], np.array([[1.0, 0, 0, 0, 0, 0, 1.0]]))
+    with (
+        ZenohBus(ZenohSettings(listen=(endpoint,)), PREFIX) as robot,
+        ZenohBus(ZenohSettings(connect=(endpoint,), mode="client"), PREFIX) as operator,
+        RecordingWriter(tmp_path / "seen.mcap") as writer,
+    ):
+        robot.queryable("map/snapshot", lambda _: Reply(b"".join(encoder.snapshot())))
+        assert operator.answered("map/snapshot", LIMIT_S)
+        recorder = LinkRecorder(operator, writer)
+        end = time.monotonic() + LIMIT_S
+        while SNAPSHOT not in writer.counts:
+            assert time.monotonic() < end
+            robot.put("telemetry", telemetry_message(1))
+            recorder.step(0.05)
+            recorder.tend()
+        recorder.finish()
+    assert writer.counts[CLOUD] == writer.counts[SNAPSHOT] == 1
+    with (tmp_path / "seen.mcap").open("rb") as file:
+        [(_, _, _, cloud)] = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages([CLOUD])
+    assert cloud.width == 3
