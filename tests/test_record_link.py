@@ -27,8 +27,8 @@ from robominer_slam.publishing.zenoh_session import ZenohBus, ZenohSettings
 from robominer_slam.recording.link_recorder import LinkRecorder
 from sim_backend.demo import program
 from tests.shown_robot import Keyframe, PublishedRobot, telemetry_message
+from tests.ros_node import MESSAGES, STAMP_NS, TOPICS, check_decoded
 from tests.secured_robot import PREFIX, SecuredRobot, free_ports
-from tests.test_ros_bridge import MESSAGES, STAMP_NS, TOPICS, check_decoded
 
 LIMIT_S = 60.0
 TELEMETRY, UPDATES, SNAPSHOT = (f"/{PREFIX}/{key}" for key in ("telemetry", "map/updates", "map/snapshot"))

@@ -14,8 +14,8 @@ import zenoh
 from robominer_slam.publishing.client_settings import client_settings
 from robominer_slam.publishing.ros_bridge import RosSettings, ros_keys, ros_layout
 from robominer_slam.publishing.zenoh_settings import open_session
+from tests.ros_node import MESSAGES, MOUNTS, TOPICS
 from tests.secured_robot import LIMIT_S, PREFIX, REFUSED_S, SecuredRobot
-from tests.test_ros_bridge import MESSAGES, MOUNTS, TOPICS
 
 PATTERNS = {"ros2dds": "@/*/@ros2_lv/**", "rmw_zenoh": "@ros2_lv/0/**"}
 

@@ -15,6 +15,7 @@ import zenoh
 from zenoh import ext
 
 from robominer_slam.publishing.keys import encoding_of, qos_of
+from robominer_slam.publishing.matching import somebody_listens
 from robominer_slam.publishing.rmw_zenoh import RmwZenohLayout
 from robominer_slam.publishing.ros2dds import Ros2DdsLayout
 from robominer_slam.publishing.ros_topics import RosBridgeName, RosLayout, RosTopic
@@ -96,11 +97,7 @@ class RosBridge:
     def wanted(self, key: str) -> bool:
         """Whether a ROS node subscribes to what a key carries."""
         copy = self._copies.get(key)
-        if copy is None or not isinstance(copy.publisher, zenoh.Publisher):
-            return False
-        # Zenoh's stubs declare the status as a plain bool.
-        status: object = copy.publisher.matching_status
-        return bool(getattr(status, "matching", status))
+        return copy is not None and somebody_listens(copy.publisher, unknown=False)
 
     def close(self) -> None:
         """Take the announcements back, then the publishers."""
@@ -110,6 +107,12 @@ class RosBridge:
         self._tokens, self._copies = [], {}
         for step in leave:
             step()
+
+
+def open_bridge(session: zenoh.Session, settings: RosSettings | None, prefix: str) -> RosBridge | None:
+    """What the settings ask for; None where that is nothing."""
+    layout = None if settings is None else ros_layout(settings, prefix)
+    return None if layout is None else RosBridge(session, layout)
 
 
 def _declare(session: zenoh.Session, key: str, topic: RosTopic) -> _Publisher:

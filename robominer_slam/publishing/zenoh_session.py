@@ -13,7 +13,8 @@ from zenoh import ext
 
 from robominer_slam.publishing.bus_messages import Query, QueryError, QueryRefusedError, Received, Reply, parameters_of
 from robominer_slam.publishing.keys import Qos, encoding_of, qos_of
-from robominer_slam.publishing.ros_bridge import RosBridge, ros_layout
+from robominer_slam.publishing.matching import somebody_listens
+from robominer_slam.publishing.ros_bridge import open_bridge
 from robominer_slam.publishing.senders import Peer, own_source, sender
 from robominer_slam.publishing.zenoh_settings import ZenohSettings, ZenohSetupError, open_session
 
@@ -66,8 +67,7 @@ class ZenohBus:
         self._publishers: dict[str, _Publisher] = {}
         self._latched: dict[str, Reply] = {}
         self._declared: list[_Declared] = []
-        layout = None if settings.ros is None else ros_layout(settings.ros, self.prefix)
-        self._ros = None if layout is None else RosBridge(self._session, layout)
+        self._ros = open_bridge(self._session, settings.ros, self.prefix)
 
     def __enter__(self) -> ZenohBus:
         return self
@@ -140,12 +140,7 @@ class ZenohBus:
         """False if nobody subscribes to the key, so that its message need not be made at all."""
         if self._ros is not None and self._ros.wanted(key):
             return True
-        publisher = self._publisher(key, None)
-        if not isinstance(publisher, zenoh.Publisher):
-            return True
-        # Zenoh's stubs declare the status as a plain bool.
-        status: object = publisher.matching_status
-        return bool(getattr(status, "matching", status))
+        return somebody_listens(self._publisher(key, None), unknown=True)
 
     def latch(self, key: str, payload: bytes, encoding: str | None = None) -> None:
         """Publish, and keep it for those who come later: by their history, or by a query of the key."""
