@@ -227,6 +227,9 @@ def listens(address: tuple[str, int]) -> bool:
         socket.create_connection(address, timeout=2.0).close()
     except ConnectionRefusedError:
         return False
+    except OSError:
+        # Reset: it is about to close.
+        return True
     return True
 
 
