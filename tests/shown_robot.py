@@ -12,7 +12,7 @@ from robominer_slam.publishing.bus_messages import Query, QueryRefusedError, Rep
 from robominer_slam.publishing.map_stream import MapStreamEncoder
 from robominer_slam.publishing.telemetry import Telemetry
 from robominer_slam.publishing.zenoh_session import ZenohBus
-from tests.test_ros_bridge import MESSAGES, MOUNTS, POSE, STAMP_NS
+from tests.ros_node import MESSAGES, MOUNTS, POSE, STAMP_NS
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Keyframe:
     points: np.ndarray
 
 
-class PublishedRobot:
+class ShownRobot:
     """Publishes everything each 40 ms until it is closed.
 
     Attributes:

@@ -6,31 +6,32 @@ import contextlib
 import json
 import socket
 import struct
+import subprocess
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from mcap_ros2._dynamic import generate_dynamic
 from websockets.sync.client import ClientConnection
 from websockets.sync.client import connect as connect_to
 from websockets.typing import Subprotocol
 
 from drivers.ros_messages import deserialize
-from robominer_slam.cli.foxglove_option import foxglove_option, show_in_foxglove
+from robominer_slam.cli.operator import operator
 from robominer_slam.configuration.file import ConfigurationError
 from robominer_slam.operator import foxglove_telemetry
 from robominer_slam.operator.foxglove_bridge import FoxgloveBridge, serve_foxglove
 from robominer_slam.publishing import pose_messages, telemetry
 from robominer_slam.publishing.pose_messages import StampedTransform
 from robominer_slam.publishing.zenoh_session import ZenohBus, ZenohSettings
-from tests.published_robot import PublishedRobot, telemetry_message
+from sim_backend.demo import program
 from tests.ros_node import MOUNTS, TOPICS, check_decoded
 from tests.secured_robot import PREFIX, free_ports
+from tests.shown_robot import ShownRobot, telemetry_message
 
 LIMIT_S = 15.0
 CLOUD, GRID = f"/{PREFIX}/map/cloud", f"/{PREFIX}/map/grid"
@@ -91,10 +92,10 @@ def sessions() -> Iterator[tuple[ZenohBus, ZenohBus]]:
 
 
 def test_a_viewer_sees_every_topic_with_its_definition(sessions: tuple[ZenohBus, ZenohBus]) -> None:
-    bus, operator = sessions
-    robot = PublishedRobot(bus)
+    bus, console = sessions
+    robot = ShownRobot(bus)
     try:
-        with FoxgloveBridge(operator, port=0) as bridge, Viewer(bridge.port) as viewer:
+        with FoxgloveBridge(console, port=0) as bridge, Viewer(bridge.port) as viewer:
             assert viewer.server["name"] == PREFIX
             # Nothing that a viewer could do but look.
             assert viewer.server["capabilities"] == []
@@ -120,10 +121,10 @@ def test_a_viewer_sees_every_topic_with_its_definition(sessions: tuple[ZenohBus,
 
 
 def test_the_map_comes_when_it_has_changed_and_not_too_often(sessions: tuple[ZenohBus, ZenohBus]) -> None:
-    bus, operator = sessions
-    robot = PublishedRobot(bus, frozenset())
+    bus, console = sessions
+    robot = ShownRobot(bus, frozenset())
     try:
-        with FoxgloveBridge(operator, port=0) as bridge, Viewer(bridge.port) as viewer:
+        with FoxgloveBridge(console, port=0) as bridge, Viewer(bridge.port) as viewer:
             viewer.subscribe(CLOUD, GRID)
             arrivals: dict[str, list[tuple[float, int]]] = {CLOUD: [], GRID: []}
             begin = time.monotonic()
@@ -156,10 +157,10 @@ def test_the_map_comes_when_it_has_changed_and_not_too_often(sessions: tuple[Zen
 
 
 def test_telemetry_stands_in_where_poses_come_seldom(sessions: tuple[ZenohBus, ZenohBus]) -> None:
-    bus, operator = sessions
-    robot = PublishedRobot(bus, frozenset({"telemetry"}))
+    bus, console = sessions
+    robot = ShownRobot(bus, frozenset({"telemetry"}))
     try:
-        with FoxgloveBridge(operator, port=0) as bridge, Viewer(bridge.port) as viewer:
+        with FoxgloveBridge(console, port=0) as bridge, Viewer(bridge.port) as viewer:
             bus.put(
                 "tf", pose_messages.transforms([StampedTransform(1, "map", "odom", np.array([5.0, *[0.0] * 5, 1.0]))])
             )
@@ -247,24 +248,31 @@ def test_a_port_that_is_taken_is_one_line(sessions: tuple[ZenohBus, ZenohBus]) -
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [([], ""), (["--foxglove"], "ws://127.0.0.1:8765"), (["--foxglove", "0"], "ws://127.0.0.1:")],
-)
-def test_a_command_is_hooked_in_with_one_option(
-    sessions: tuple[ZenohBus, ZenohBus], arguments: list[str], said: str
-) -> None:
-    @click.command()
-    @foxglove_option
-    def operator(foxglove_port: int | None) -> None:
-        with contextlib.ExitStack() as stack:
+def test_the_console_serves_foxglove_on_its_own_session() -> None:
+    [port] = free_ports(1)
+    with ZenohBus(ZenohSettings(listen=(f"tcp/127.0.0.1:{port}",)), PREFIX) as bus:
+        robot = ShownRobot(bus)
+        command = program(
+            "operator", "--connect", f"tcp/127.0.0.1:{port}", "--port", "0", "--foxglove", "0", "--no-open"
+        )
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as console:
             try:
-                show_in_foxglove(stack, sessions[1], foxglove_port)
-            except ConfigurationError as error:
-                # Where a viewer's server runs on this machine already.
-                click.echo(f"ws://{str(error).split()[2]}")
+                assert console.stdout is not None
+                said = console.stdout.readline()
+                assert said.startswith("Foxglove: ws://127.0.0.1:")
+                with Viewer(int(said.rsplit(":", 1)[1])) as viewer:
+                    viewer.subscribe(f"/{PREFIX}/pose")
+                    topic, _, payload = viewer.next()
+                    assert viewer.decode(topic, payload).pose.pose.position.y == 2.0
+                # One session for both, so that a slow link carries everything once.
+                assert bus.links() == 1
+            finally:
+                console.kill()
+                robot.close()
 
-    result = CliRunner().invoke(operator, arguments)
-    assert result.exit_code == 0, result.output
-    assert said in result.output
-    assert bool(result.output) == bool(said)
+
+def test_foxglove_is_not_for_recordings(tmp_path: Path) -> None:
+    recording = tmp_path / "drive.mcap"
+    recording.touch()
+    with pytest.raises(ConfigurationError, match="Foxglove opens a recording"):
+        operator.main(["--recording", str(recording), "--foxglove"], standalone_mode=False)

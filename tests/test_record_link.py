@@ -26,9 +26,9 @@ from robominer_slam.publishing.map_stream import MapStreamDecoder, MapStreamEnco
 from robominer_slam.publishing.zenoh_session import ZenohBus, ZenohSettings
 from robominer_slam.recording.link_recorder import LinkRecorder
 from sim_backend.demo import program
-from tests.shown_robot import Keyframe, PublishedRobot, telemetry_message
 from tests.ros_node import MESSAGES, STAMP_NS, TOPICS, check_decoded
 from tests.secured_robot import PREFIX, SecuredRobot, free_ports
+from tests.shown_robot import Keyframe, ShownRobot, telemetry_message
 
 LIMIT_S = 60.0
 TELEMETRY, UPDATES, SNAPSHOT = (f"/{PREFIX}/{key}" for key in ("telemetry", "map/updates", "map/snapshot"))
@@ -39,7 +39,7 @@ CLOUD = f"/{PREFIX}/map/cloud"
 def endpoint() -> Iterator[str]:
     [port] = free_ports(1)
     with ZenohBus(ZenohSettings(listen=(f"tcp/127.0.0.1:{port}",)), PREFIX) as bus:
-        robot = PublishedRobot(bus)
+        robot = ShownRobot(bus)
         yield f"tcp/127.0.0.1:{port}"
         robot.close()
 
@@ -194,7 +194,7 @@ def wait_for_bytes(path: Path, count: int) -> None:
 def test_a_viewer_records_by_tls_what_a_viewer_may_see(tmp_path: Path) -> None:
     secured = SecuredRobot(tmp_path)
     with secured.bus:
-        robot = PublishedRobot(secured.bus)
+        robot = ShownRobot(secured.bus)
         out = tmp_path / "seen.mcap"
         try:
             done = record(

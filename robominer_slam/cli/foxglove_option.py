@@ -1,14 +1,9 @@
-"""`--foxglove` of `robominer-slam operator`: the console's session, shown to a Foxglove viewer as well.
-
-@foxglove_option
-def operator(..., foxglove_port: int | None, ...):
-...
-show_in_foxglove(stack, bus, foxglove_port)
-"""
+"""`--foxglove` of `robominer-slam operator`: the console's session, shown to a Foxglove viewer as well."""
 
 from __future__ import annotations
 
 import contextlib
+import sys
 from typing import TYPE_CHECKING
 
 import click
@@ -43,3 +38,4 @@ def show_in_foxglove(stack: contextlib.ExitStack, bus: ZenohBus, port: int | Non
 
     bridge = stack.enter_context(FoxgloveBridge(bus, port))
     click.echo(f"Foxglove: ws://{HOST}:{bridge.port}")
+    sys.stdout.flush()
