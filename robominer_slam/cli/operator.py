@@ -11,8 +11,8 @@ from pathlib import Path
 
 import click
 
-from robominer_slam.cli.foxglove_option import foxglove_option, show_in_foxglove
 from robominer_slam.configuration.file import ConfigurationError
+from robominer_slam.operator.foxglove_option import foxglove_option, show_in_foxglove
 
 
 @click.command(

@@ -10,6 +10,7 @@ Protocol: https://github.com/foxglove/ws-protocol; it knows no passwords, so the
 from __future__ import annotations
 
 import importlib.util
+import ipaddress
 import logging
 import threading
 import time
@@ -22,7 +23,6 @@ import numpy as np
 from drivers.ros_messages import MessageError, schema_text
 from robominer_slam.configuration.file import ConfigurationError
 from robominer_slam.operator import foxglove_telemetry
-from robominer_slam.operator.access import is_loopback
 from robominer_slam.publishing import telemetry
 from robominer_slam.publishing.bus_messages import QueryError, Received
 from robominer_slam.publishing.keys import encoding_of
@@ -68,7 +68,7 @@ class FoxgloveBridge:
         """
         if importlib.util.find_spec("foxglove") is None:
             raise ConfigurationError("--foxglove needs foxglove-sdk: pip install 'robominer-slam[operator]'")
-        if not is_loopback(host):
+        if not _is_own(host):
             raise ConfigurationError(
                 f"Foxglove on {host}: anybody there could look; serve on 127.0.0.1 and tunnel, as with ssh -L {port}"
             )
@@ -232,3 +232,10 @@ def serve_foxglove(
     with FoxgloveBridge(bus, port, host) as bridge:
         on_ready(f"ws://{host}:{bridge.port}")
         stop.wait()
+
+
+def _is_own(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
