@@ -32,6 +32,21 @@ class RecordingError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
+class ForeignFormat:
+    """A format of messages that are none of ROS's.
+
+    Attributes:
+        name: as the schema's.
+        encoding: of the messages; readers that do not know it leave them alone.
+        description: in words, and where to read more.
+    """
+
+    name: str
+    encoding: str
+    description: str
+
+
+@dataclass(frozen=True, slots=True)
 class TopicMeaning:
     """A role that a topic can play.
 

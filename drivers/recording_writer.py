@@ -22,6 +22,7 @@ from drivers.recording_format import (
     SCHEMA_ENCODING,
     SENSOR_PERIOD_KEY,
     WHISKER_TRUTH,
+    ForeignFormat,
     RecordingError,
 )
 from drivers.ros_messages import Message, schema_text, serialize
@@ -131,10 +132,23 @@ class RecordingWriter:
             MessageError: unknown type, or a message that does not fit it.
         """
         data = message if isinstance(message, bytes) else serialize(message, typename)
+        self._add(topic, self._channel(topic, typename), data, log_time_ns, publish_time_ns)
+
+    def write_foreign(
+        self, topic: str, form: ForeignFormat, data: bytes, log_time_ns: int, publish_time_ns: int | None = None
+    ) -> None:
+        """Write a message that is none of ROS's, with words on its format in the channel's metadata.
+
+        Raises:
+            RecordingError: the file cannot be written.
+        """
+        self._add(topic, self._foreign_channel(topic, form), data, log_time_ns, publish_time_ns)
+
+    def _add(self, topic: str, channel: int, data: bytes, log_time_ns: int, publish_time_ns: int | None) -> None:
         sequence = self.counts.get(topic, 0)
         try:
             self._writer.add_message(
-                channel_id=self._channel(topic, typename),
+                channel_id=channel,
                 log_time=log_time_ns,
                 data=data,
                 publish_time=log_time_ns if publish_time_ns is None else publish_time_ns,
@@ -161,6 +175,17 @@ class RecordingWriter:
         """Write what the whiskers really did; the log time is the stamp where none is given."""
         topic, log_time = MEANINGS[WHISKER_TRUTH].topic, truth.stamp_ns if log_time_ns is None else log_time_ns
         self.write(topic, ground_truth.WHISKERS_TYPENAME, ground_truth.encode_whiskers(truth), log_time, truth.stamp_ns)
+
+    def flush(self) -> None:
+        """Hand every chunk that is complete to the system, so that what kills this program leaves them.
+
+        Raises:
+            RecordingError: the file cannot be written.
+        """
+        try:
+            self._file.flush()
+        except OSError as error:
+            raise self._failed(error) from error
 
     def close(self) -> None:
         """Write the rest and the index, and close the file; again is harmless."""
@@ -219,4 +244,18 @@ class RecordingWriter:
                 self._schemas[typename] = schema
             channel = self._writer.register_channel(topic=topic, message_encoding=MESSAGE_ENCODING, schema_id=schema)
             self._channels[topic, typename] = channel
+        return channel
+
+    def _foreign_channel(self, topic: str, form: ForeignFormat) -> int:
+        channel = self._channels.get((topic, form.name))
+        if channel is None:
+            # With a name, but no definition: readers stumble over definitions in a language that they do not know.
+            schema = self._writer.register_schema(name=form.name, encoding="", data=b"")
+            channel = self._writer.register_channel(
+                topic=topic,
+                message_encoding=form.encoding,
+                schema_id=schema,
+                metadata={"format": form.description},
+            )
+            self._channels[topic, form.name] = channel
         return channel

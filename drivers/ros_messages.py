@@ -96,6 +96,17 @@ def deserialize(data: bytes, typename: str) -> Message:
         raise MessageError(f"not a message of type {typename}: {error or 'wrong size'}") from error
 
 
+@cache
+def type_hash(typename: str) -> str:
+    """Hash of the type's definition, `RIHS01_` and 64 hexadecimal digits (REP-2016): by it ROS nodes know a type.
+
+    Raises:
+        MessageError: unknown type.
+    """
+    _check_known(typename)
+    return typestore().hash_rihs01(typename)
+
+
 def time_from_ns(stamp_ns: int) -> Message:
     """`builtin_interfaces/msg/Time` of integer nanoseconds."""
     sec, nanosec = divmod(stamp_ns, NANOSECONDS_PER_SECOND)

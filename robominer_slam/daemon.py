@@ -140,7 +140,7 @@ class Daemon:
         self._bus.put("status", report_messages.diagnostics(stamp, entries))
         # At once: links within the machine tell the short one by that, and drop it (tls_settings.py).
         if self._bus.remote and self._remote_status.due(now, entries, self._bus.remote_links()):
-            self._bus.put("status", short_status(stamp, entries))
+            self._bus.put("status", short_status(stamp, entries), ros=False)
 
     def _diagnostics(self, now_ns: int) -> list[Diagnostic]:
         frame = self._last_frame

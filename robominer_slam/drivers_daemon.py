@@ -38,5 +38,5 @@ def forward(source: MeasurementSource, bus: ZenohBus, stop: threading.Event) -> 
             stamp = clock.now_unix_ns()
             bus.put("status", report_messages.diagnostics(stamp, entries))
             if bus.remote and remote_status.due(time.monotonic_ns(), entries, bus.remote_links()):
-                bus.put("status", short_status(stamp, entries))
+                bus.put("status", short_status(stamp, entries), ros=False)
     log.info("ended after %d measurements", forwarded)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from robominer_slam.publishing.zenoh_session import ZenohBus
 from robominer_slam.security.credentials import load_credentials
 from robominer_slam.security.inspection import inspect
 from robominer_slam.sources.source import MeasurementSource
+from robominer_slam.sources.tapped_source import TappedSource
 from robominer_slam.sources.zenoh_source import ZenohSource
 from robominer_slam.store import MapStore
 from robominer_slam.store_reader import map_to_start_in
@@ -49,7 +51,8 @@ def serve(configuration: Configuration, config_file: Path, stop: threading.Event
     with contextlib.ExitStack() as stack:
         if robot.role == "drivers":
             reader = SerialReader(device_settings(configuration))
-            bus = stack.enter_context(ZenohBus(settings, prefix))
+            # The board with the SLAM is the one that ROS sees: all topics are its own.
+            bus = stack.enter_context(ZenohBus(replace(settings, ros=None), prefix))
             forward(stack.enter_context(reader), bus, stop)
             return
         array = calibrated_array(configuration, folder)
@@ -60,7 +63,9 @@ def serve(configuration: Configuration, config_file: Path, stop: threading.Event
         bus = stack.enter_context(ZenohBus(settings, prefix))
         stack.enter_context(store)
         source: MeasurementSource = (
-            ZenohSource(bus, WallClock()) if robot.role == "slam" else SerialReader(device_settings(configuration))
+            ZenohSource(bus, WallClock())
+            if robot.role == "slam"
+            else TappedSource(SerialReader(device_settings(configuration)), bus, WallClock())
         )
         stack.enter_context(source)
         Daemon(configuration, array, source, bus, store, known).run(stop)

@@ -7,8 +7,9 @@ import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
-from robominer_slam.configuration.model import ZenohSection
+from robominer_slam.configuration.zenoh_section import ZenohSection
 from robominer_slam.publishing.bus_messages import Received
 from robominer_slam.publishing.client_settings import client_settings
 from robominer_slam.publishing.robot_settings import robot_settings
@@ -37,7 +38,9 @@ def free_ports(count: int) -> list[int]:
 class SecuredRobot:
     """An authority, and a robot that listens on TLS and on loopback."""
 
-    def __init__(self, folder: Path, *, remote_ros: bool = False) -> None:
+    def __init__(
+        self, folder: Path, *, remote_ros: bool = False, ros: Literal["none", "ros2dds", "rmw_zenoh"] = "none"
+    ) -> None:
         self.authority = Authority.create(folder / "keys")
         for name, role, days in (
             ("rm3", "robot", 30),
@@ -54,7 +57,10 @@ class SecuredRobot:
         tls, tcp = free_ports(2)
         self.tls, self.tcp = f"tls/localhost:{tls}", f"tcp/127.0.0.1:{tcp}"
         section = ZenohSection(
-            credentials=str(self.bundle("rm3")), listen=(f"tls/127.0.0.1:{tls}", self.tcp), remote_ros=remote_ros
+            credentials=str(self.bundle("rm3")),
+            listen=(f"tls/127.0.0.1:{tls}", self.tcp),
+            remote_ros=remote_ros,
+            ros=ros,
         )
         self.settings = robot_settings(section, folder, PREFIX)
         self.bus = ZenohBus(self.settings, PREFIX)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from robominer_slam.configuration.model import ZenohSection
+from robominer_slam.configuration.zenoh_section import ZenohSection
 from robominer_slam.publishing.bus_messages import Query, QueryError, Received, Reply
 from robominer_slam.publishing.client_settings import client_settings
 from robominer_slam.publishing.robot_settings import robot_settings

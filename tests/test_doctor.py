@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from robominer_slam.cli.doctor import doctor
-from robominer_slam.configuration.model import ZenohSection
+from robominer_slam.configuration.zenoh_section import ZenohSection
 from robominer_slam.publishing.bus_messages import Reply
 from robominer_slam.publishing.robot_settings import robot_settings
 from robominer_slam.publishing.zenoh_session import ZenohBus

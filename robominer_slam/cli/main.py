@@ -49,6 +49,7 @@ COMMANDS = {
     "keys": "robominer_slam.cli.keys:keys",
     "map": "robominer_slam.cli.map:map_group",
     "operator": "robominer_slam.cli.operator:operator",
+    "record": "robominer_slam.cli.record:record",
     "replay": "robominer_slam.cli.replay:replay",
     "run": "robominer_slam.cli.run:run",
     "status": "robominer_slam.cli.status:status",

@@ -12,6 +12,7 @@ from pathlib import Path
 import click
 
 from robominer_slam.configuration.file import ConfigurationError
+from robominer_slam.operator.foxglove_option import foxglove_option, show_in_foxglove
 
 
 @click.command(
@@ -41,6 +42,7 @@ Example of a recording: robominer-slam operator --recording drive.mcap"""
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
     help="With --recording: configuration; the recording's own by default.",
 )
+@foxglove_option
 @click.option(
     "--open/--no-open", "browse", default=None, help="Open a browser here.  [default: where there is a display]"
 )
@@ -54,6 +56,7 @@ def operator(
     token: str | None,
     recording: Path | None,
     config_file: Path | None,
+    foxglove_port: int | None,
     browse: bool | None,
 ) -> None:
     """The operator's console: the robot over Zenoh in, a web page out."""
@@ -65,6 +68,8 @@ def operator(
     from robominer_slam.operator.web_server import ServerError, listening_socket, serve
     from robominer_slam.publishing.client_settings import client_settings
 
+    if recording is not None and foxglove_port is not None:
+        raise ConfigurationError("--foxglove: shows a robot; Foxglove opens a recording (MCAP) by itself")
     if not is_loopback(host) and not token:
         raise ConfigurationError(f"--host {host}: others could reach the robot there; give --token SECRET as well")
     try:
@@ -78,7 +83,9 @@ def operator(
             session = stack.enter_context(RecordingSource(recording, config_file))
         else:
             settings = replace(client_settings(connect, credentials, timeout), max_message_bytes=MAX_MESSAGE_BYTES)
-            session = stack.enter_context(RobotLink(settings, robot))
+            link = stack.enter_context(RobotLink(settings, robot))
+            show_in_foxglove(stack, link.bus, foxglove_port)
+            session = link
         if browse is None:
             browse = sys.stdout.isatty() and bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
         serve(session, listener, token, on_ready=_tell, browse=browse)

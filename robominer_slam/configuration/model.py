@@ -7,10 +7,10 @@ from typing import Literal
 from pydantic import Field, ValidationInfo, field_validator
 
 from robominer_slam.configuration.device_section import DeviceSection
-from robominer_slam.configuration.parameter import KeyChunk, Section, parameter
+from robominer_slam.configuration.parameter import KeyChunk, Section, is_ros_name, parameter
 from robominer_slam.configuration.robust_estimation_section import RobustEstimationSection
 from robominer_slam.configuration.robust_slam_section import RobustSlamSection
-from robominer_slam.security.endpoints import check
+from robominer_slam.configuration.zenoh_section import ZenohSection
 
 
 class RobotSection(Section):
@@ -257,29 +257,6 @@ class StoreSection(Section):
     )
 
 
-class ZenohSection(Section):
-    """The network."""
-
-    credentials: str | None = parameter(
-        None, "", "folder with the robot's bundle from `keys issue`; without it nothing leaves the machine"
-    )
-    listen: tuple[str, ...] = parameter(
-        ("tcp/127.0.0.1:7447",), "", "endpoints to listen on: loopback, and with credentials tls/0.0.0.0:7448"
-    )
-    connect: tuple[str, ...] = parameter((), "", "endpoints to connect to: loopback, and with credentials tls/")
-    remote_ros: bool = parameter(
-        False, "", "send ROS topics on TLS links at full rate: half a Mbit/s, too much for a slow one"
-    )
-    ros: Literal["none"] = parameter("none", "", "what ROS 2 bridges need in addition")
-
-    @field_validator("listen", "connect")
-    @classmethod
-    def _nothing_leaves_unprotected(cls, value: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
-        for endpoint in value:
-            check(endpoint, credentials=bool(info.data.get("credentials")))
-        return value
-
-
 class Configuration(Section):
     """The whole configuration file."""
 
@@ -295,6 +272,17 @@ class Configuration(Section):
     map: MapSection = Field(default_factory=MapSection)
     store: StoreSection = Field(default_factory=StoreSection)
     zenoh: ZenohSection = Field(default_factory=ZenohSection)
+
+    @field_validator("zenoh")
+    @classmethod
+    def _ros_can_say_the_name(cls, value: ZenohSection, info: ValidationInfo) -> ZenohSection:
+        robot = info.data.get("robot")
+        if value.ros != "none" and robot is not None and not is_ros_name(robot.id):
+            raise ValueError(
+                f"expected with ros = {value.ros!r} a robot.id that ROS takes for a name (letters, digits and single "
+                f"underscores, no digit first), found {robot.id!r}"
+            )
+        return value
 
     @field_validator("device")
     @classmethod

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
@@ -15,6 +16,15 @@ def _one_key_chunk(value: str) -> str:
 
 #: A name that becomes one chunk of a Zenoh key.
 KeyChunk = Annotated[str, AfterValidator(_one_key_chunk)]
+
+#: A part of a ROS name: letters, digits and single underscores, no digit first
+#: (https://design.ros2.org/articles/topic_and_service_names.html).
+_ROS_NAME = re.compile(r"(?!.*__)[A-Za-z_][A-Za-z0-9_]*")
+
+
+def is_ros_name(part: str) -> bool:
+    """Whether a text may stand between the slashes of a ROS name."""
+    return _ROS_NAME.fullmatch(part) is not None
 
 
 class Section(BaseModel):

@@ -96,6 +96,11 @@ class RobotLink:
         self._thread.join(QUERY_TIMEOUT_S + 1.0)
         self._bus.close()
 
+    @property
+    def bus(self) -> ZenohBus:
+        """The session, for what else listens to the robot in this process."""
+        return self._bus
+
     def tap(self, callback: Callable[[Received], None]) -> None:
         """Also hand every message that is received to `callback`, in the thread that received it."""
         self._taps.append(callback)

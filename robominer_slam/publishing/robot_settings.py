@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from robominer_slam.configuration.model import ZenohSection
+from robominer_slam.configuration.zenoh_section import ZenohSection
+from robominer_slam.publishing.ros_bridge import RosSettings, ros_keys, ros_layout, ros_readable
 from robominer_slam.publishing.tls_settings import remote_rates, tls
 from robominer_slam.publishing.zenoh_settings import ZenohSettings
 from robominer_slam.security.access_list import COMMANDING
@@ -24,8 +25,10 @@ def robot_settings(section: ZenohSection, folder: Path, prefix: str) -> ZenohSet
     Raises:
         KeysError: credentials that cannot be used.
     """
+    ros = None if section.ros == "none" else RosSettings(section.ros, section.ros_domain)
     if section.credentials is None:
-        return ZenohSettings(listen=section.listen, connect=section.connect)
+        return ZenohSettings(listen=section.listen, connect=section.connect, ros=ros)
+    layout = None if ros is None else ros_layout(ros, prefix)
     credentials = load_credentials(folder / section.credentials)
     access = credentials.access_list()
     return ZenohSettings(
@@ -33,9 +36,10 @@ def robot_settings(section: ZenohSection, folder: Path, prefix: str) -> ZenohSet
         connect=section.connect,
         remote=any(is_tls(endpoint) for endpoint in (*section.listen, *section.connect)),
         commanders=access.names(COMMANDING),
+        ros=ros,
         further={
             **tls(credentials, serves=True),
-            "access_control": access_control(access, prefix),
-            **remote_rates(prefix, remote_ros=section.remote_ros),
+            "access_control": access_control(access, prefix, () if layout is None else ros_readable(layout)),
+            **remote_rates(prefix, {} if layout is None else ros_keys(layout), remote_ros=section.remote_ros),
         },
     )

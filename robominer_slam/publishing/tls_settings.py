@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from robominer_slam.publishing.map_records import MAX_MESSAGE_BYTES
 from robominer_slam.security.access_rules import PLAIN_PROTOCOLS
 from robominer_slam.security.credentials import Credentials
@@ -24,6 +26,8 @@ _SLOW_LINK: dict[str, object] = {
     "transport/link/tx/lease": 5000,
     "connect/retry": {"period_init_ms": 500, "period_max_ms": 1000, "period_increase_factor": 2},
 }
+#: Likewise of their copies for ROS, where `status` is always the full one.
+REMOTE_COPIES_HZ = {**REMOTE_ROS_HZ, "status": 0.1}
 #: `status` goes out in full and then, at once, in short. The full one is too large for TLS links; on the others the
 #: short one comes too soon after it. Full ones are a second apart.
 _LOCAL_STATUS_HZ = 2.0
@@ -51,11 +55,12 @@ def tls(credentials: Credentials, *, serves: bool) -> dict[str, object]:
     return {**_SLOW_LINK, **{f"transport/link/tls/{key}": value for key, value in values.items()}}
 
 
-def remote_rates(prefix: str, *, remote_ros: bool) -> dict[str, object]:
+def remote_rates(prefix: str, copies: Mapping[str, str], *, remote_ros: bool) -> dict[str, object]:
     """What a TLS link carries of the messages that are made for the robot's own machine.
 
     Args:
         prefix: `robominer/<robot id>`.
+        copies: whole keys on which ROS gets the same messages, each with the key under the prefix.
         remote_ros: leave the ROS topics at their rates.
     """
     status = f"{prefix}/status"
@@ -68,11 +73,15 @@ def remote_rates(prefix: str, *, remote_ros: bool) -> dict[str, object]:
         }
     ]
     if not remote_ros:
-        rules = [{"key_expr": f"{prefix}/{key}", "freq": rate} for key, rate in REMOTE_ROS_HZ.items()]
+        rates = {f"{prefix}/{key}": rate for key, rate in REMOTE_ROS_HZ.items()}
+        rates |= {copy: REMOTE_COPIES_HZ[key] for copy, key in copies.items() if key in REMOTE_COPIES_HZ}
+        rules = [{"key_expr": key, "freq": rate} for key, rate in rates.items()]
         downsampling.append({"flows": ["egress"], "messages": ["put"], "link_protocols": ["tls"], "rules": rules})
     too_large = [_too_large("put", [f"{prefix}/{key}"], limit) for key, limit in REMOTE_BYTES.items()]
     if not remote_ros:
-        too_large += [_too_large("put", [f"{prefix}/{key}"], limit) for key, limit in REMOTE_ROS_BYTES.items()]
+        for key, limit in REMOTE_ROS_BYTES.items():
+            same = [copy for copy, original in copies.items() if original == key]
+            too_large.append(_too_large("put", [f"{prefix}/{key}", *same], limit))
         too_large.append(_too_large("reply", [f"{prefix}/{key}" for key in WHOLE_ANSWERS], REMOTE_ANSWER_BYTES))
     return {"downsampling": downsampling, "low_pass_filter": too_large}
 

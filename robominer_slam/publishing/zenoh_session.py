@@ -14,6 +14,8 @@ from zenoh import ext
 from robominer_slam.publishing import asking
 from robominer_slam.publishing.bus_messages import Query, QueryError, QueryRefusedError, Received, Reply, parameters_of
 from robominer_slam.publishing.keys import Qos, encoding_of, qos_of, qos_of_query
+from robominer_slam.publishing.matching import somebody_listens
+from robominer_slam.publishing.ros_bridge import open_bridge
 from robominer_slam.publishing.senders import Peer, own_source, sender
 from robominer_slam.publishing.zenoh_settings import ZenohSettings, ZenohSetupError, open_session
 
@@ -66,6 +68,7 @@ class ZenohBus:
         self._publishers: dict[str, _Publisher] = {}
         self._latched: dict[str, Reply] = {}
         self._declared: list[_Declared] = []
+        self._ros = open_bridge(self._session, settings.ros, self.prefix)
 
     def __enter__(self) -> ZenohBus:
         return self
@@ -82,6 +85,8 @@ class ZenohBus:
             publishers, self._publishers = list(self._publishers.values()), {}
         if self._session.is_closed():
             return
+        if self._ros is not None:
+            self._ros.close()
         # Zenoh's stubs leave these methods without a return type.
         leave: list[Callable[[], None]] = [entity.undeclare for entity in (*declared, *publishers)]
         leave.append(self._session.close)
@@ -108,6 +113,7 @@ class ZenohBus:
         *,
         qos: Qos | None = None,
         attachment: bytes | None = None,
+        ros: bool = True,
     ) -> None:
         """Publish.
 
@@ -117,18 +123,18 @@ class ZenohBus:
             encoding: by default that of the key (`keys.encoding_of`); `keys.cdr(type)` for `raw/<device>`.
             qos: how it travels, by default as `keys.qos_of` says; that of a key's first message holds.
             attachment: small bytes that travel beside the payload.
+            ros: whether it goes to ROS, too, where that is set up.
         """
         chosen = encoding_of(key) if encoding is None else encoding
         self._publisher(key, qos).put(payload, encoding=chosen, attachment=attachment)
+        if self._ros is not None and ros:
+            self._ros.put(key, payload)
 
     def wanted(self, key: str) -> bool:
         """False if nobody subscribes to the key, so that its message need not be made at all."""
-        publisher = self._publisher(key, None)
-        if not isinstance(publisher, zenoh.Publisher):
+        if self._ros is not None and self._ros.wanted(key):
             return True
-        # Zenoh's stubs declare the status as a plain bool.
-        status: object = publisher.matching_status
-        return bool(getattr(status, "matching", status))
+        return somebody_listens(self._publisher(key, None), unknown=True)
 
     def latch(self, key: str, payload: bytes, encoding: str | None = None) -> None:
         """Publish, and keep it for those who come later: by their history, or by a query of the key."""

@@ -10,6 +10,8 @@ from typing import Literal
 
 import zenoh
 
+from robominer_slam.publishing.ros_bridge import RosSettings
+
 #: Zenoh's own default is 1 GiB, for anyone who can reach the port.
 MAX_MESSAGE_BYTES = 1 << 20
 #: A lost link is tried again after one second, then at most every two.
@@ -35,6 +37,7 @@ class ZenohSettings:
             client fails at once.
         remote: whether TLS links are to be served, with their short `status`.
         commanders: names in certificates whose holders may send commands.
+        ros: who in ROS is to see the topics; None: nobody.
         further: more of Zenoh's configuration, path to value, such as TLS and access control.
     """
 
@@ -45,6 +48,7 @@ class ZenohSettings:
     connect_timeout_s: float | None = None
     remote: bool = False
     commanders: tuple[str, ...] = ()
+    ros: RosSettings | None = None
     further: Mapping[str, object] = field(default_factory=dict)
 
 

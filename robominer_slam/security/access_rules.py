@@ -25,6 +25,8 @@ _ALL_MESSAGES = (
     "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable", "liveliness_token",
     "liveliness_query", "declare_liveliness_subscriber",
 )  # fmt: skip
+#: All keys: `**` stops at chunks that start with `@`, where histories and the announcements of ROS are.
+_ANY_KEY = ("**", "**/@adv/**", "@/**", "@/*/@ros2_lv/**", "@ros2_lv/**")
 #: Rules of each role.
 _POLICIES: Mapping[Role, tuple[str, ...]] = {
     "robot": ("everything of the robot",),
@@ -33,18 +35,19 @@ _POLICIES: Mapping[Role, tuple[str, ...]] = {
 }
 
 
-def access_control(access: AccessList, prefix: str) -> dict[str, object]:
+def access_control(access: AccessList, prefix: str, further: Sequence[str] = ()) -> dict[str, object]:
     """The value of Zenoh's `access_control`.
 
     Args:
         access: who has which role.
         prefix: `robominer/<robot id>`.
+        further: whole keys that everybody on the list may read as well: what ROS is shown.
     """
-    readable = _under(prefix, READABLE)
+    readable = (*_under(prefix, READABLE), *further)
     commands = _under(prefix, COMMANDS)
     both = ("ingress", "egress")
     rules = [
-        _rule("everything", both, _ALL_MESSAGES, ("**", "**/@adv/**", "@/**", "@/**/@ros2_lv/**", "@ros2_lv/**")),
+        _rule("everything", both, _ALL_MESSAGES, _ANY_KEY),
         _rule("everything of the robot", both, _ALL_MESSAGES, _under(prefix, ("**", "**/@adv/**"))),
         _rule(
             "ask to look",

@@ -1,0 +1,1 @@
+"""Recordings of a running robot: its raw sensors, or what came over the link."""
