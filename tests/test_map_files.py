@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -88,7 +89,8 @@ def test_points_come_back_from_ply_and_pcd(database: Path) -> None:
 
 def octomap_cells(path: Path) -> np.ndarray:
     """Centres of occupied cells as OctoMap's own program reads them, shape (n, 3)."""
-    assert shutil.which("bt2vrml"), "install octomap-tools, as .ci/run does"
+    if shutil.which("bt2vrml") is None and not os.environ.get("ROBOMINER_SLAM_CI"):
+        pytest.skip("octomap-tools is not installed: apt-get install octomap-tools")
     subprocess.run(["bt2vrml", str(path)], check=True, capture_output=True, timeout=60)
     text = Path(f"{path}.wrl").read_text()
     found = re.findall(r"translation (\S+) (\S+) (\S+)", text)
