@@ -91,17 +91,21 @@ def test_stamps_and_values_are_the_simulators(tmp_path, protocols):
     with measured(tmp_path, protocols, seconds, field) as (heard, start):
         frames = heard["whiskers"]
         assert len(frames) > 80
-        lateness = []
+        lateness, last = [], -1
+        sent = field.reshape(-1, 8, 8, 3)
         for frame in frames:
             assert isinstance(frame, HallFrame)
             assert frame.sensor_period_ns == 600_000
-            k = round((frame.stamp_ns - start.monotonic_ns) / (40 * MS))
+            values = sent[..., 0]
+            if frame.representation != "Cartesian":
+                values = np.degrees(np.arctan2(sent[..., 1], sent[..., 0]))
+            # Told by what it says: on a busy machine a burst may come so late that its stamp is another frame's.
+            [k] = np.flatnonzero((np.abs(frame.field_mT[..., 0] - values) < 0.0102).all(axis=(1, 2)))
+            assert k > last
+            last = int(k)
             lateness.append(frame.stamp_ns - start.monotonic_ns - 40 * MS * k)
-            scale = 1.0 if frame.representation == "Cartesian" else 180.0 / np.pi
-            sent = field[k].reshape(8, 8, 3)
-            value = sent[..., 0] if scale == 1.0 else np.degrees(np.arctan2(sent[..., 1], sent[..., 0]))
-            np.testing.assert_allclose(frame.field_mT[..., 0], value, atol=0.0101)
         assert np.median(np.abs(lateness)) < 2 * MS
+        assert np.mean(np.abs(lateness) < 10 * MS) > 0.9
         imu = heard["imu"]
         assert len(imu) > 350
         increments = AttitudeIncrements()
