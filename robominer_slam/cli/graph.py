@@ -24,7 +24,7 @@ _SHOWN = 20
 _MEANING = {"gtsam": "full SE(n) log (GTSAM)", "g2o": "t and theta or q_vec (g2o)"}
 
 
-@click.group()
+@click.group(epilog="Example: robominer-slam graph optimize intel.g2o --out optimum.g2o")
 def graph() -> None:
     """Pose graphs in g2o's text format."""
 
