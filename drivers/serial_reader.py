@@ -304,7 +304,8 @@ class SerialReader:
         entry.logged = now
         level = logging.WARNING if device.fault else logging.INFO
         detail = device.fault or device.path
-        log.log(level, "device %s: %s (%s)", device.settings.name, device.state, detail)
+        name, fields = device.settings.name, {"device": device.settings.name, "state": device.state}
+        log.log(level, "device %s: %s (%s)", name, device.state, detail, extra=fields)
 
 
 def _reason(error: BaseException) -> str:

@@ -29,7 +29,9 @@ from robominer_slam.publishing.zenoh_session import ZenohBus
 from robominer_slam.remote_status import RemoteStatus, short_status
 from robominer_slam.slam.saved_map import SavedMap
 from robominer_slam.sources.source import MeasurementSource
+from robominer_slam.status_words import slam_words
 from robominer_slam.store import MapStore
+from robominer_slam.supervision import Progress, Supervision
 from robominer_slam.telemetry_frame import telemetry
 from robominer_slam.wall_clock import WallClock
 
@@ -53,6 +55,7 @@ class Daemon:
         source: MeasurementSource,
         bus: ZenohBus,
         store: MapStore,
+        supervision: Supervision,
         known: SavedMap | None = None,
     ) -> None:
         self._configuration = configuration
@@ -60,6 +63,7 @@ class Daemon:
         self._source = source
         self._bus = bus
         self._store = store
+        self._supervision = supervision
         self._lock = threading.Lock()
         self._clock = WallClock()
         self._carries = {one.name: one.carries for one in device_settings(configuration)}
@@ -93,6 +97,7 @@ class Daemon:
                             self._frame(result)
                     self._status()
         finally:
+            self._supervision.stopping()
             self._finish()
 
     def _frame(self, result: FrameResult) -> None:
@@ -141,6 +146,20 @@ class Daemon:
         # At once: links within the machine tell the short one by that, and drop it (tls_settings.py).
         if self._bus.remote and self._remote_status.due(now, entries, self._bus.remote_links()):
             self._bus.put("status", short_status(stamp, entries), ros=False)
+        self._supervise()
+
+    def _supervise(self) -> None:
+        frames, devices = self._publisher.frames, self._source.status()
+        refused = self._pipeline.wrong_size_frames + self._pipeline.stale_frames + self._pipeline.reorder.dropped
+        idle = not any(one.state == "streaming" and self._carries.get(one.name) == "whiskers" for one in devices)
+        rate = self._supervision.rate_hz(frames)
+        words = slam_words(self._last_frame, rate, len(self._map.keyframes), devices)
+        self._supervision.turn(Progress(frames, refused, idle), words, self._apply)
+
+    def _apply(self, configuration: Configuration) -> None:
+        self._configuration = configuration
+        self._map_service.section = configuration.map
+        self._store.sync_s = configuration.store.sync_s
 
     def _diagnostics(self, now_ns: int) -> list[Diagnostic]:
         frame = self._last_frame

@@ -31,13 +31,16 @@ class MapService:
         clock: for stamps.
         keyframe_map: the map; this is the only place that changes it.
         section: cells of what is published.
+
+    Attributes:
+        section: as above; another one takes effect at the next answer, its stream_cell at the next new map.
     """
 
     def __init__(self, bus: ZenohBus, clock: WallClock, keyframe_map: KeyframeMap, section: MapSection) -> None:
         self.keyframe_map = keyframe_map
         self._bus = bus
         self._clock = clock
-        self._section = section
+        self.section = section
         self._publisher = self._new_publisher()
         self._path_ns: int | None = None
         self._path_version = 0
@@ -60,7 +63,7 @@ class MapService:
         self._publisher.update(whole.version, whole.keyframes, poses, self._clock.offset_ns)
 
     def _new_publisher(self) -> MapPublisher:
-        return MapPublisher(self._bus, secrets.randbits(64), self._section.stream_cell)
+        return MapPublisher(self._bus, secrets.randbits(64), self.section.stream_cell)
 
     def load(self, known: SavedMap) -> None:
         """Start with a map that was saved."""
@@ -98,10 +101,10 @@ class MapService:
     def grid(self) -> list[Reply]:
         """OccupancyGrid: steps as obstacles."""
         try:
-            grid = height_grid(self.keyframe_map.cloud(), self._section.grid_cell)
+            grid = height_grid(self.keyframe_map.cloud(), self.section.grid_cell)
         except GridSizeError as error:
             raise QueryRefusedError(str(error)) from error
-        cells = np.ascontiguousarray(occupancy(grid, self._section.obstacle_height))
+        cells = np.ascontiguousarray(occupancy(grid, self.section.obstacle_height))
         message = report_messages.occupancy_grid(self._clock.now_unix_ns(), MAP, grid.cell, grid.origin, cells)
         return [Reply(message)]
 

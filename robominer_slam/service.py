@@ -14,8 +14,10 @@ from robominer_slam.configuration.array import calibrated_array
 from robominer_slam.configuration.devices import device_settings
 from robominer_slam.configuration.file import ConfigurationError
 from robominer_slam.configuration.model import Configuration
+from robominer_slam.configuration.reload import Reload
 from robominer_slam.daemon import Daemon
 from robominer_slam.drivers_daemon import forward
+from robominer_slam.notify import Notifier
 from robominer_slam.publishing.robot_settings import robot_settings
 from robominer_slam.publishing.zenoh_session import ZenohBus
 from robominer_slam.security.credentials import load_credentials
@@ -25,23 +27,24 @@ from robominer_slam.sources.tapped_source import TappedSource
 from robominer_slam.sources.zenoh_source import ZenohSource
 from robominer_slam.store import MapStore
 from robominer_slam.store_reader import map_to_start_in
+from robominer_slam.supervision import Supervision
 from robominer_slam.wall_clock import WallClock
 
 log = logging.getLogger(__name__)
 
 
-def serve(configuration: Configuration, config_file: Path, stop: threading.Event) -> None:
+def serve(configuration: Configuration, reload: Reload, stop: threading.Event) -> None:
     """Run until `stop` is set.
 
     Args:
         configuration: the effective one.
-        config_file: where it came from: relative paths in it start there.
+        reload: reads it anew from where it came from; relative paths in it start there.
         stop: set by SIGTERM and SIGINT.
 
     Raises:
         ConfigurationError and the other errors of a user's mistake, before anything runs.
     """
-    robot, folder = configuration.robot, config_file.parent
+    robot, config_file, folder = configuration.robot, reload.path, reload.path.parent
     if robot.role != "slam" and not configuration.device:
         raise ConfigurationError(f"{config_file}: device: missing; expected a [[device]] for each port")
     prefix = f"robominer/{robot.id}"
@@ -49,11 +52,13 @@ def serve(configuration: Configuration, config_file: Path, stop: threading.Event
     if configuration.zenoh.credentials is not None:
         _say_if_expired(folder / configuration.zenoh.credentials)
     with contextlib.ExitStack() as stack:
+        notifier = stack.enter_context(contextlib.closing(Notifier()))
+        supervision = Supervision(notifier, reload)
         if robot.role == "drivers":
             reader = SerialReader(device_settings(configuration))
             # The board with the SLAM is the one that ROS sees: all topics are its own.
             bus = stack.enter_context(ZenohBus(replace(settings, ros=None), prefix))
-            forward(stack.enter_context(reader), bus, stop)
+            forward(stack.enter_context(reader), bus, stop, supervision)
             return
         array = calibrated_array(configuration, folder)
         path = folder / configuration.store.path
@@ -68,7 +73,7 @@ def serve(configuration: Configuration, config_file: Path, stop: threading.Event
             else TappedSource(SerialReader(device_settings(configuration)), bus, WallClock())
         )
         stack.enter_context(source)
-        Daemon(configuration, array, source, bus, store, known).run(stop)
+        Daemon(configuration, array, source, bus, store, supervision, known).run(stop)
 
 
 def _say_if_expired(credentials: Path) -> None:

@@ -77,6 +77,7 @@ class MapStore:
         written: keyframes on the disk.
         fault: why nothing is being written now; empty if all is well.
         dropped: keyframes that could not be written because the disk has been failing for long.
+        sync_s: a keyframe is on the disk at most this long after it was made.
         frozen: whether the map must stay as it is: nothing is written then.
     """
 
@@ -87,7 +88,7 @@ class MapStore:
         self.folder = path.parent
         self._connection = open_database(path)
         self._lock = threading.Lock()
-        self._sync_s = sync_s
+        self.sync_s = sync_s
         self._queue: queue.Queue[list[_Change] | None] = queue.Queue(QUEUE_LENGTH)
         self._late: list[_Change] = []
         self.map_id = self._start_map(robot, name) if map_id is None else map_id
@@ -177,7 +178,7 @@ class MapStore:
 
     def new_map(self, robot: str, name: str) -> None:
         """What is added from now on belongs to a new map."""
-        self.flush(self._sync_s * 2)
+        self.flush(self.sync_s * 2)
         with self._lock:
             self.map_id = self._start_map(robot, name)
         self.frozen = False
@@ -218,7 +219,7 @@ class MapStore:
             stopping = item is None
             taken = 1
             # Half the time that a keyframe may wait is for collecting, the rest for a slow card.
-            end = time.monotonic() + self._sync_s / 2
+            end = time.monotonic() + self.sync_s / 2
             while not stopping and (left := end - time.monotonic()) > 0:
                 try:
                     item = self._queue.get(timeout=left)

@@ -18,6 +18,7 @@ from robominer_slam import __version__
 from robominer_slam.configuration.file import ConfigurationError
 from robominer_slam.evaluation.run_record import ResultsError
 from robominer_slam.evaluation.trajectory import TrajectoryError
+from robominer_slam.journal import stderr_is_journal
 from robominer_slam.layout import LayoutError
 from robominer_slam.publishing.zenoh_session import ZenohSetupError
 from robominer_slam.security.errors import KeysError
@@ -101,6 +102,8 @@ def main() -> None:
     except click.Abort:
         sys.exit(130)
     except USER_ERRORS as error:
+        # In the journal a line's level is a prefix; there is no log yet.
+        prefix = "<3>" if stderr_is_journal() else ""
         for line in str(error).splitlines():
-            click.echo(f"error: {line}", err=True)
+            click.echo(f"{prefix}error: {line}", err=True)
         sys.exit(2)

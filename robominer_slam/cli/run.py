@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import threading
 from pathlib import Path
@@ -17,15 +18,22 @@ FILE = click.Path(dir_okay=False, path_type=Path)
 @click.option("--config", "config_file", type=FILE, required=True, help="Configuration file (TOML).")
 @click.option("--print-config", is_flag=True, help="Print the effective configuration with units and reasons, and end.")
 def run(config_file: Path, print_config: bool) -> None:
-    """Run the daemon: devices in, Zenoh out, until SIGTERM or SIGINT."""
+    """Run the daemon: devices in, Zenoh out, until SIGTERM or SIGINT; SIGHUP reads the configuration anew."""
     configuration = load(config_file)
     if print_config:
         click.echo(to_toml(configuration), nl=False)
         return
     # Imported here so that a mistake in the file is reported at once, without the seconds that the rest takes to load.
-    from robominer_slam.service import serve
+    from robominer_slam.configuration.reload import Reload
+    from robominer_slam.log_output import LogOutput
 
+    output = LogOutput(configuration.log, verbose=logging.getLogger().level == logging.DEBUG)
+    reload = Reload(config_file, configuration, output.configure)
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
-    serve(configuration, config_file, stop)
+    signal.signal(signal.SIGHUP, lambda *_: reload.ask())
+
+    from robominer_slam.service import serve
+
+    serve(configuration, reload, stop)

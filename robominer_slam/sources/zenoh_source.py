@@ -5,12 +5,13 @@ from __future__ import annotations
 import logging
 import queue
 import struct
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 
 from drivers import measurement_messages
 from drivers.counters import Counters
-from drivers.device import DeviceStatus
+from drivers.device import SILENT_NS, DeviceState, DeviceStatus
 from drivers.measurement import HallFrame, Measurement
 from robominer_slam.publishing.bus_messages import Received
 from robominer_slam.publishing.keys import cdr
@@ -46,6 +47,7 @@ class ZenohSource:
         self._clock = clock
         self._queue: queue.Queue[tuple[str, Measurement]] = queue.Queue(QUEUE_LENGTH)
         self._counters: dict[str, Counters] = {}
+        self._heard_ns: dict[str, int] = {}
         self.dropped = 0
 
     def __enter__(self) -> ZenohSource:
@@ -64,13 +66,17 @@ class ZenohSource:
 
     def status(self) -> Sequence[DeviceStatus]:
         """The remote devices that have been heard, with the counts of what came."""
-        return [
-            DeviceStatus(name, "streaming", f"raw/{name}", "", dict(counters), 0, 0, 0.0, "")
-            for name, counters in sorted(self._counters.items())
-        ]
+        return [self._status(name, counters) for name, counters in sorted(self._counters.items())]
+
+    def _status(self, name: str, counters: Counters) -> DeviceStatus:
+        silent = time.monotonic_ns() - self._heard_ns[name] > SILENT_NS
+        state: DeviceState = "silent" if silent else "streaming"
+        fault = "nothing comes from its board" if silent else ""
+        return DeviceStatus(name, state, f"raw/{name}", "", dict(counters), 0, 0, 0.0, fault)
 
     def _take(self, received: Received) -> None:
         device = received.key.removeprefix("raw/")
+        self._heard_ns[device] = time.monotonic_ns()
         counters = self._counters.setdefault(device, Counters())
         period_ns = 0
         if received.attachment is not None and len(received.attachment) == SENSOR_PERIOD.size:
