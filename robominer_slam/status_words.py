@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -56,4 +57,4 @@ def device_words(devices: Sequence[DeviceStatus]) -> str:
 
 
 def _length(metres: float) -> str:
-    return f"{metres * 100:.0f} cm" if metres < 1.0 else f"{metres:.1f} m"
+    return f"{math.ceil(metres * 100)} cm" if metres < 1.0 else f"{metres:.1f} m"
