@@ -27,7 +27,7 @@ COLOURS = {"ok": "green", "warning": "yellow", "error": "red"}
 def doctor(
     config: Path | None, connect: str | None, credentials: Path | None, robot: str, timeout: float, as_json: bool
 ) -> None:
-    """What is wrong with configuration, keys and connection. Exits 0 when content, 1 when not."""
+    """What is wrong with configuration, devices, board, keys and connection. Exits 0 when content, 1 when not."""
     if config is None and connect is None and credentials is None:
         raise click.UsageError("nothing to look at: give --config, --credentials or --connect")
     findings = _findings(config, connect, credentials, robot, timeout)

@@ -4,33 +4,33 @@ from __future__ import annotations
 
 import json
 import queue
+import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import click
-from rich.console import Console
-from rich.table import Table
+from rich.console import Console, Group
+from rich.live import Live
 
-from drivers.ros_messages import deserialize
+from robominer_slam.cli.status_table import described, entries_of, tables
 from robominer_slam.publishing.client_settings import client_settings
-from robominer_slam.publishing.report_messages import DIAGNOSTIC_ARRAY, Level
 from robominer_slam.publishing.zenoh_session import ZenohBus
 
 FOLDER = click.Path(file_okay=False, path_type=Path)
 #: A daemon that is there takes the connection at once.
 CONNECT_TIMEOUT_S = 5.0
-#: Keys of the whiskers that are not well, as `status_report.py` writes them: `whisker (row, column)`.
-WHISKER = "whisker "
-COLOURS = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "red", Level.STALE: "magenta"}
+#: How often a picture that waits for news says for how long.
+WAITING_S = 1.0
 
 
-@click.command(epilog="Example: robominer-slam status --connect tcp/127.0.0.1:7447")
+@click.command(epilog="Example: robominer-slam status --connect tcp/127.0.0.1:7447 --watch")
 @click.option("--connect", default="tcp/127.0.0.1:7447", show_default=True, help="Endpoint of the daemon.")
 @click.option("--credentials", type=FOLDER, help="Folder with your bundle from `keys issue`, for tls/ endpoints.")
 @click.option("--robot", default="rm3", show_default=True, help="The robot's id.")
 @click.option("--timeout", default=12.0, show_default=True, help="How long to wait for an answer, s.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def status(connect: str, credentials: Path | None, robot: str, timeout: float, as_json: bool) -> None:
+@click.option("--watch", is_flag=True, help="Go on, refreshed in place, until Ctrl+C.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON; with --watch a line for each message.")
+def status(connect: str, credentials: Path | None, robot: str, timeout: float, watch: bool, as_json: bool) -> None:
     """What a running daemon says of itself; it speaks once a second, and to remote links in short, each ten seconds."""
     messages: queue.Queue[bytes] = queue.Queue()
     settings = client_settings(connect, credentials, min(timeout, CONNECT_TIMEOUT_S))
@@ -43,38 +43,29 @@ def status(connect: str, credentials: Path | None, robot: str, timeout: float, a
                 f"nothing on robominer/{robot}/status within {timeout:g} s: is the robot's id right, "
                 "and is your name on its access list?"
             ) from None
-    entries: list[Any] = list(deserialize(payload, DIAGNOSTIC_ARRAY).status)
-    if as_json:
-        described = [
-            {
-                "name": entry.name,
-                "level": Level(entry.level).name,
-                "message": entry.message,
-                "values": {value.key: value.value for value in entry.values},
-            }
-            for entry in entries
-        ]
-        click.echo(json.dumps(described))
-        return
-    table = Table(title=f"robominer/{robot}")
-    for column in ("part", "level", "says", "figures"):
-        table.add_column(column)
-    for entry in entries:
-        level = Level(entry.level)
-        shown = [value for value in entry.values if value.value and not value.key.startswith(WHISKER)]
-        figures = "\n".join(f"{value.key} = {value.value}" for value in shown)
-        table.add_row(entry.name, f"[{COLOURS[level]}]{level.name}[/]", entry.message, figures)
-    Console().print(table)
-    unwell = [
-        (value.key.removeprefix(WHISKER).strip("()"), value.value)
-        for entry in entries
-        for value in entry.values
-        if value.key.startswith(WHISKER)
-    ]
-    if unwell:
-        whiskers = Table(title="whiskers left out of the map")
-        for column in ("row, column", "state"):
-            whiskers.add_column(column)
-        for place, state in unwell:
-            whiskers.add_row(place, state)
-        Console().print(whiskers)
+        title = f"robominer/{robot}"
+        if as_json:
+            click.echo(json.dumps(described(entries_of(payload))))
+            while watch:
+                click.echo(json.dumps(described(entries_of(messages.get()))))
+        elif watch:
+            _follow(title, payload, messages.get)
+        else:
+            Console().print(tables(title, entries_of(payload)))
+
+
+def _follow(title: str, payload: bytes, take: Callable[..., bytes]) -> None:
+    """Show each message in the place of the one before, and how old the last one is when nothing more comes."""
+    heard = time.monotonic()
+    picture = tables(title, entries_of(payload), flat=True)
+    # Not in a screen of its own: the last state stays in sight after Ctrl+C.
+    with Live(picture, console=Console(), auto_refresh=False) as live:
+        while True:
+            try:
+                payload = take(timeout=WAITING_S)
+            except queue.Empty:
+                silent_s = time.monotonic() - heard
+                live.update(Group(picture, f"last heard {silent_s:.0f} s ago"), refresh=True)
+                continue
+            heard, picture = time.monotonic(), tables(title, entries_of(payload), flat=True)
+            live.update(picture, refresh=True)
