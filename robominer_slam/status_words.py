@@ -57,4 +57,4 @@ def device_words(devices: Sequence[DeviceStatus]) -> str:
 
 
 def _length(metres: float) -> str:
-    return f"{math.ceil(metres * 100)} cm" if metres < 1.0 else f"{metres:.1f} m"
+    return f"{max(1, math.ceil(metres * 100))} cm" if metres < 1.0 else f"{metres:.1f} m"

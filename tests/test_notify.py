@@ -186,6 +186,10 @@ def test_a_main_loop_that_stands_still_starves_the_watchdog(
     manager.during(1.0)  # what was on its way
     assert manager.during(2.5) == []
     assert daemon.poll() is None
+    # What systemd does then; the log has the place where it hung.
+    daemon.send_signal(signal.SIGABRT)
+    assert daemon.wait(LIMIT_S) == -signal.SIGABRT
+    assert "in hanging" in (tmp_path / "log").read_text()
 
 
 def test_without_systemd_nothing_is_sent():

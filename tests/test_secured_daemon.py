@@ -18,6 +18,7 @@ from drivers.ros_messages import deserialize
 from robominer_slam.cli.doctor import doctor
 from robominer_slam.cli.status import status
 from robominer_slam.configuration.file import load
+from robominer_slam.configuration.reload import Reload
 from robominer_slam.layout import to_json
 from robominer_slam.publishing.client_settings import client_settings
 from robominer_slam.publishing.report_messages import DIAGNOSTIC_ARRAY
@@ -164,7 +165,8 @@ def test_an_expired_certificate_is_said_and_the_robot_goes_on(tmp_path: Path, ca
             f'[zenoh]\nlisten = ["tcp/127.0.0.1:{tcp}", "tls/127.0.0.1:{tls}"]\ncredentials = "keys/holders/{name}"\n'
         )
         stop = threading.Event()
-        thread = threading.Thread(target=serve, args=(load(path), path, stop))
+        configuration = load(path)
+        thread = threading.Thread(target=serve, args=(configuration, Reload(path, configuration), stop))
         thread.start()
         try:
             with ZenohBus(client_settings(f"tcp/127.0.0.1:{tcp}", None, LIMIT_S), PREFIX) as local:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import logging
 import signal
 import threading
@@ -27,6 +28,8 @@ def run(config_file: Path, print_config: bool) -> None:
     from robominer_slam.configuration.reload import Reload
     from robominer_slam.log_output import LogOutput
 
+    # The watchdog ends a daemon that hangs by SIGABRT: where each thread stood is then in the journal.
+    faulthandler.enable()
     output = LogOutput(configuration.log, verbose=logging.getLogger().level == logging.DEBUG)
     reload = Reload(config_file, configuration, output.configure)
     stop = threading.Event()
