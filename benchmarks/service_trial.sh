@@ -113,6 +113,8 @@ kill -CONT "$simulator"
 wait_for 10 'the robot is back' says 'whiskers streaming'
 inside kill -STOP "$(property MainPID)"
 wait_for 60 'a daemon that stands still is started again' is NRestarts 1
+inside journalctl --no-pager -u robominer-slam | grep -q 'Fatal Python error: Aborted'
+echo 'ok: the journal has where it stood'
 wait_for 40 'and is ready again' is SubState running
 inside systemctl stop robominer-slam
 is Result success && echo 'ok: a clean end'

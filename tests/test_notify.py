@@ -18,15 +18,16 @@ import pytest
 from robominer_slam.notify import Notifier
 from sim_backend.demo import free_port, program
 
-LIMIT_S = 20.0
-#: The daemon, whose publishing hangs for ever once a file is there: a main loop that stands still.
+#: A busy machine takes its time; what is well takes a second.
+LIMIT_S = 60.0
+#: The daemon, whose publishing hangs while a file is there: a main loop that stands still.
 HANGING = """
-import pathlib, sys, threading
+import pathlib, sys, time
 from robominer_slam import publisher
 frame, hang = publisher.Publisher.frame, pathlib.Path(sys.argv.pop())
 def hanging(self, result):
-    if hang.exists():
-        threading.Event().wait()
+    while hang.exists():
+        time.sleep(0.05)
     frame(self, result)
 publisher.Publisher.frame = hanging
 from robominer_slam.cli.main import main
@@ -126,70 +127,64 @@ def logged(folder: Path, text: str) -> str:
 def test_the_life_of_a_service(
     tmp_path: Path, robot: subprocess.Popen[bytes], daemon: subprocess.Popen[bytes], manager: Manager
 ):
-    # Nothing flows yet: not ready, but it says what it waits for, and asks for time and no reload.
+    # Nothing flows yet: not ready, but it says what it waits for and asks for time; a silent sensor is no hang.
     heard = manager.until(lambda m: m.startswith("EXTEND_TIMEOUT_USEC="), "that the start takes longer")
     heard += manager.until(lambda m: "whiskers silent" in m, "that the whiskers are silent")
+    heard += manager.until(lambda m: m == "WATCHDOG=1", "a sign of life")
+    # Before READY there is no reload for systemd.
     daemon.send_signal(signal.SIGHUP)
-    heard += manager.during(1.5)
-    assert "STATUS=waiting for the first whisker frame" in "\n".join(heard)
-    assert not {"READY=1"} & set(heard)
-    assert not [m for m in heard if m.startswith("RELOADING")]
-    assert "WATCHDOG=1" in heard  # a silent sensor is no hang
     logged(tmp_path, "nothing has changed")
+    heard += manager.during(0.5)
+    assert any(m.startswith("STATUS=waiting for the first whisker frame") for m in heard)
+    assert not [m for m in heard if m.startswith(("READY", "RELOADING"))]
 
     robot.send_signal(signal.SIGCONT)
     manager.until(lambda m: m == "READY=1", "ready")
     assert "first whisker frame: publishing poses" in (tmp_path / "log").read_text()
     manager.until(lambda m: m.startswith("STATUS=tracking") and " Hz, " in m, "the state in words")
-    manager.until(lambda m: m == "WATCHDOG=1", "a sign of life")
 
-    # Reload: what can change live does, what cannot is named; a broken file changes nothing.
-    config = tmp_path / "config.toml"
-    good = config.read_text()
-    changed = good + '\n[map]\ngrid_cell = 0.07\n[contact]\nflow_whiskers = 9\n[log]\nlevel = "warning"\n'
-    config.write_text(changed)
-    daemon.send_signal(signal.SIGHUP)
-    manager.until(lambda m: m.startswith("RELOADING=1\nMONOTONIC_USEC="), "reloading")
-    manager.until(lambda m: m == "READY=1", "ready after the reload")
-    logged(tmp_path, "reloaded: map.grid_cell = 0.07, was 0.05")
-    assert "WARNING" in logged(tmp_path, "contact.flow_whiskers has changed to 9: needs a restart")
-    config.write_text(good + "\n[map]\ngrid_cell = -1\n")
-    daemon.send_signal(signal.SIGHUP)
-    assert "map.grid_cell: expected" in logged(tmp_path, "not reloaded, the old configuration stays")
-    before = (tmp_path / "log").read_text().count("INFO")
-    config.write_text(changed)
-    daemon.send_signal(signal.SIGHUP)
-    manager.until(lambda m: m.startswith("RELOADING=1"), "the third reload")
-    manager.until(lambda m: m == "READY=1", "ready after the third reload")
-    assert (tmp_path / "log").read_text().count("INFO") == before  # the level is in force
+    check_reloading(tmp_path, daemon, manager)
+
+    # A main loop that stands still starves the watchdog.
+    (tmp_path / "hang").touch()
+    manager.during(1.0)  # what was on its way
+    assert manager.during(2.5) == []
+    (tmp_path / "hang").unlink()
+    manager.until(lambda m: m == "WATCHDOG=1", "a sign of life")
 
     # The devices fall silent, then are unplugged: said at once, and no reason to be killed.
     robot.send_signal(signal.SIGSTOP)
     manager.until(lambda m: "whiskers silent" in m, "that the whiskers are silent")
-    assert "WATCHDOG=1" in manager.during(2.0)
+    manager.until(lambda m: m == "WATCHDOG=1", "a sign of life")
     robot.kill()
     manager.until(lambda m: "whiskers absent" in m, "that the whiskers are gone")
-    assert "WATCHDOG=1" in manager.during(1.5)
+    manager.until(lambda m: m == "WATCHDOG=1", "a sign of life")
 
     daemon.send_signal(signal.SIGTERM)
     manager.until(lambda m: m == "STOPPING=1", "the end")
     assert daemon.wait(LIMIT_S) == 0
 
 
-def test_a_main_loop_that_stands_still_starves_the_watchdog(
-    tmp_path: Path, robot: subprocess.Popen[bytes], daemon: subprocess.Popen[bytes], manager: Manager
-):
-    robot.send_signal(signal.SIGCONT)
-    manager.until(lambda m: m == "READY=1", "ready")
-    manager.until(lambda m: m == "WATCHDOG=1", "a sign of life")
-    (tmp_path / "hang").touch()
-    manager.during(1.0)  # what was on its way
-    assert manager.during(2.5) == []
-    assert daemon.poll() is None
-    # What systemd does then; the log has the place where it hung.
-    daemon.send_signal(signal.SIGABRT)
-    assert daemon.wait(LIMIT_S) == -signal.SIGABRT
-    assert "in hanging" in (tmp_path / "log").read_text()
+def check_reloading(folder: Path, daemon: subprocess.Popen[bytes], manager: Manager) -> None:
+    """What can change live does, what cannot is named; a broken file changes nothing."""
+
+    def reload(text: str) -> None:
+        config.write_text(text)
+        daemon.send_signal(signal.SIGHUP)
+        manager.until(lambda m: m.startswith("RELOADING=1\nMONOTONIC_USEC="), "reloading")
+        manager.until(lambda m: m == "READY=1", "ready after the reload")
+
+    config = folder / "config.toml"
+    good = config.read_text()
+    changed = good + '\n[map]\ngrid_cell = 0.07\n[contact]\nflow_whiskers = 9\n[log]\nlevel = "warning"\n'
+    reload(changed)
+    logged(folder, "reloaded: map.grid_cell = 0.07, was 0.05")
+    assert "WARNING" in logged(folder, "contact.flow_whiskers has changed to 9: needs a restart")
+    reload(good + "\n[map]\ngrid_cell = -1\n")
+    assert "map.grid_cell: expected" in logged(folder, "not reloaded, the old configuration stays")
+    before = (folder / "log").read_text().count("INFO")
+    reload(changed.replace("0.07", "0.08"))
+    assert (folder / "log").read_text().count("INFO") == before  # the level is in force
 
 
 def test_without_systemd_nothing_is_sent():
