@@ -100,9 +100,9 @@ wait_for 40 'ready, shut in' is SubState running
 wait_for 20 'says so in words' says 'whiskers streaming'
 inside sed -i 's/^source = "fused"/source = "odometry"/' /etc/robominer-slam/config.toml
 inside systemctl reload robominer-slam
-named() { inside journalctl --no-pager -p warning -u robominer-slam | grep -q 'estimation.source .* needs a restart'; }
+named() { inside journalctl --no-pager -p warning -u robominer-slam | grep 'estimation.source .* needs a restart' >/dev/null; }
 wait_for 10 'a reload names what needs a restart' named
-inside journalctl --no-pager -u robominer-slam DEVICE=whiskers STATE=streaming | grep -q streaming
+inside journalctl --no-pager -u robominer-slam DEVICE=whiskers STATE=streaming | grep streaming >/dev/null
 echo 'ok: the journal knows devices by field'
 kill -STOP "$simulator"
 wait_for 10 'a silent robot is said' says 'whiskers silent'
@@ -113,8 +113,8 @@ kill -CONT "$simulator"
 wait_for 10 'the robot is back' says 'whiskers streaming'
 inside kill -STOP "$(property MainPID)"
 wait_for 60 'a daemon that stands still is started again' is NRestarts 1
-inside journalctl --no-pager -u robominer-slam | grep -q 'Fatal Python error: Aborted'
-echo 'ok: the journal has where it stood'
+traced() { inside journalctl --no-pager -u robominer-slam | grep 'Fatal Python error: Aborted' >/dev/null; }
+wait_for 5 'the journal has where it stood' traced
 wait_for 40 'and is ready again' is SubState running
 inside systemctl stop robominer-slam
 is Result success && echo 'ok: a clean end'
