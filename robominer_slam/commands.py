@@ -15,6 +15,7 @@ from robominer_slam.pipeline import Pipeline
 from robominer_slam.publishing.bus_messages import Query, Reply
 from robominer_slam.slam.place_prior import PlacePrior
 from robominer_slam.store import MapStore
+from robominer_slam.store_database import StoreError
 
 log = logging.getLogger(__name__)
 
@@ -129,10 +130,13 @@ class Commands:
             raise CommandError("the map is frozen ([slam] start = 'localize'): there is nothing to save")
         if not self._store.flush(STORE_TIMEOUT_S):
             raise CommandError("the disk did not take the map within 5 s; see status")
-        self._store.save_poses(self._map.poses, self._map.ids, self._map.edges)
         name = parameters.get("name", "")
-        if name:
-            self._store.rename(name)
+        try:
+            self._store.save_poses(self._map.poses, self._map.ids, self._map.edges)
+            if name:
+                self._store.rename(name)
+        except StoreError as error:
+            raise CommandError(f"{error}; see status") from error
         return f"map {name or self._store.map_id} saved: {len(self._map.keyframes)} keyframes"
 
     def _start_new_map(self, _: Mapping[str, str]) -> str:

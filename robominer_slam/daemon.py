@@ -31,6 +31,7 @@ from robominer_slam.slam.saved_map import SavedMap
 from robominer_slam.sources.source import MeasurementSource
 from robominer_slam.status_words import slam_words
 from robominer_slam.store import MapStore
+from robominer_slam.store_database import StoreError
 from robominer_slam.supervision import Progress, Supervision
 from robominer_slam.telemetry_frame import telemetry
 from robominer_slam.wall_clock import WallClock
@@ -182,7 +183,12 @@ class Daemon:
                     self._map.take(result)
                     self._store.add(result, self._clock.offset_ns)
         if self._store.flush(10.0):
-            self._store.save_poses(self._map.poses, self._map.ids, self._map.edges)
+            try:
+                self._store.save_poses(self._map.poses, self._map.ids, self._map.edges)
+            except StoreError as error:
+                log.error("%s; the next start has those of some seconds ago", error)
+        else:
+            log.error("ended with keyframes that are not stored: %s", self._store.fault or "the disk is too slow")
         log.info(
             "ended after %d frames: %d keyframes, %d loop closures, %d keyframes stored",
             self._publisher.frames, len(self._map.keyframes), self._map.closures, self._store.written,

@@ -71,4 +71,5 @@ def _with_slam(inputs: ReplayInputs, update: dict[str, str]) -> ReplayInputs:
 
 
 def _store(inputs: ReplayInputs, path: Path, map_id: int | None) -> MapStore:
-    return MapStore(path, SYNC_S, inputs.configuration.robot.id, "", map_id)
+    voxel = inputs.configuration.store.point_voxel
+    return MapStore(path, SYNC_S, inputs.configuration.robot.id, "", map_id, point_voxel=voxel)

@@ -22,11 +22,14 @@ from robominer_slam.publishing.robot_settings import robot_settings
 from robominer_slam.publishing.zenoh_session import ZenohBus
 from robominer_slam.security.credentials import load_credentials
 from robominer_slam.security.inspection import inspect
+from robominer_slam.slam.saved_map import SavedMap
 from robominer_slam.sources.source import MeasurementSource
 from robominer_slam.sources.tapped_source import TappedSource
 from robominer_slam.sources.zenoh_source import ZenohSource
 from robominer_slam.store import MapStore
+from robominer_slam.store_database import StoreError
 from robominer_slam.store_reader import map_to_start_in
+from robominer_slam.store_salvage import Salvage, check_and_salvage
 from robominer_slam.supervision import Supervision
 from robominer_slam.wall_clock import WallClock
 
@@ -62,9 +65,13 @@ def serve(configuration: Configuration, reload: Reload, stop: threading.Event) -
             return
         array = calibrated_array(configuration, folder)
         path = folder / configuration.store.path
-        map_id, known = map_to_start_in(configuration.slam, path, WallClock().offset_ns)
-        frozen = configuration.slam.start == "localize"
-        store = MapStore(path, configuration.store.sync_s, robot.id, "", map_id, frozen)
+        salvage = check_and_salvage(path)
+        map_id, known = map_to_start_with(configuration, path, salvage)
+        frozen = configuration.slam.start == "localize" and map_id is not None
+        kept = configuration.store
+        store = MapStore(
+            path, kept.sync_s, robot.id, "", map_id, frozen, salvage, point_voxel=kept.point_voxel, max_mb=kept.max_mb
+        )
         bus = stack.enter_context(ZenohBus(settings, prefix))
         stack.enter_context(store)
         source: MeasurementSource = (
@@ -74,6 +81,26 @@ def serve(configuration: Configuration, reload: Reload, stop: threading.Event) -
         )
         stack.enter_context(source)
         Daemon(configuration, array, source, bus, store, supervision, known).run(stop)
+
+
+def map_to_start_with(
+    configuration: Configuration, path: Path, salvage: Salvage
+) -> tuple[int, SavedMap] | tuple[None, None]:
+    """As `map_to_start_in`; where the database was damaged and the map is gone, a new one rather than no start.
+
+    Raises:
+        ConfigurationError and StoreError: mistakes of the user's.
+    """
+    if salvage.postponed:
+        log.error("a new map begins in memory, since the stored ones cannot be read now")
+        return None, None
+    try:
+        return map_to_start_in(configuration.slam, path, WallClock().offset_ns)
+    except StoreError as error:
+        if not salvage.reason:
+            raise
+        log.error("a new map begins, since the one to start in was not among what was salvaged: %s", error)
+        return None, None
 
 
 def _say_if_expired(credentials: Path) -> None:

@@ -105,8 +105,16 @@ def store_diagnostic(store: MapStore) -> Diagnostic:
         values["disk.free_MB"] = str(shutil.disk_usage(store.folder).free // 1_000_000)
     except OSError as error:
         values["disk.fault"] = str(error)
+    if store.salvage.reason:
+        values["salvage"] = str(store.salvage)
     if store.fault:
-        return Diagnostic("store", Level.ERROR, f"not stored: {store.fault}", values)
+        text = f"not stored, mapping in memory: {store.fault}"
+        return Diagnostic("store", Level.ERROR, text, {**values, "waiting": str(store.unwritten)})
+    if store.too_large:
+        text = "the map alone is larger than [store] max_mb; it is stored all the same"
+        return Diagnostic("store", Level.WARN, text, values)
+    if store.salvage.reason:
+        return Diagnostic("store", Level.WARN, f"{store.written} keyframes stored; the database was damaged", values)
     return Diagnostic("store", Level.OK, f"{store.written} keyframes stored", values)
 
 

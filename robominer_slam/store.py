@@ -1,11 +1,8 @@
 """Keyframes kept in SQLite: one writer thread, batched commits, WAL with full sync.
 
 What the back-end takes out of the graph is taken out here too, with its edges; the edges that bridge it are added.
-
-The rows of a drive are written with plain SQL, since sqlite-utils costs 5 ms a row. A
-batch is on the disk at most `sync_s` after its oldest keyframe.
-Poses that the back-end has moved since are written every few seconds, the weights of edges with them: a process
-that is killed loses no more than that.
+Rows are written with plain SQL, since sqlite-utils costs 5 ms a row. A batch is on the disk at most `sync_s` after its
+oldest keyframe. Poses that the back-end has moved since are written every few seconds, the weights of edges with them.
 """
 
 from __future__ import annotations
@@ -16,57 +13,28 @@ import sqlite3
 import threading
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robominer_slam import geometry
-from robominer_slam.slam.keyframe import BackendResult, GraphEdge, Keyframe, Merge
-from robominer_slam.store_database import open_database, pack_points, unpack_points
+from robominer_slam.slam.keyframe import BackendResult, GraphEdge
+from robominer_slam.store_changes import Change, MapRow
+from robominer_slam.store_corrections import POSE_TOLERANCE, SAVED_TOLERANCE, Corrections, edge_keys
+from robominer_slam.store_database import StoreError, StoreFullError, is_full, open_database, transaction
+from robominer_slam.store_salvage import Salvage, check_and_salvage
+from robominer_slam.store_size import thin, used_bytes
 
 log = logging.getLogger(__name__)
 
 FloatArray = NDArray[np.float64]
-#: Kind, i, j: an edge's name in its map.
-EdgeKey = tuple[str, int, int]
 
 QUEUE_LENGTH = 256
-UPPER = np.triu_indices(6)
+#: What failed is tried again at least this often, s: there may be room again while the robot stands still.
+RETRY_S = 2.0
 #: From one writing of corrected poses to the next, s: each costs a page per few keyframes.
 POSES_INTERVAL_S = 4.0
-#: Poses that moved less than this since they were written are not written again, m or (of the rotation) 1.
-POSE_TOLERANCE = 0.001
-
-
-@dataclass(frozen=True, slots=True)
-class _Change:
-    """What a result changes in the store; without the poses of the whole map, since many may wait for the disk.
-
-    Attributes:
-        keyframes: new ones, with their poses in map.
-        edges: new ones.
-        removed, merged, bare: as in `BackendResult`.
-        clock_offset_ns: added to stamps.
-    """
-
-    keyframes: Sequence[tuple[Keyframe, FloatArray]]
-    edges: Sequence[GraphEdge]
-    removed: Sequence[int]
-    merged: Sequence[Merge]
-    bare: Sequence[int]
-    clock_offset_ns: int
-
-    @classmethod
-    def of(cls, result: BackendResult, edges: Sequence[GraphEdge], clock_offset_ns: int) -> _Change:
-        place = {k: n for n, k in enumerate(result.keyframe_ids)} if result.new_keyframes else {}
-        keyframes = [(k, result.poses[place[k.id]].copy()) for k in result.new_keyframes]
-        return cls(keyframes, edges, result.removed, result.merged, result.bare, clock_offset_ns)
-
-    def without_keyframes(self) -> _Change:
-        """What is left of it when its keyframes are lost."""
-        return replace(self, keyframes=())
 
 
 class MapStore:
@@ -79,31 +47,76 @@ class MapStore:
         dropped: keyframes that could not be written because the disk has been failing for long.
         sync_s: a keyframe is on the disk at most this long after it was made.
         frozen: whether the map must stay as it is: nothing is written then.
+        salvage: what the check at the start found.
+        too_large: whether the current map alone is larger than the database may be; it is stored all the same.
     """
 
     def __init__(
-        self, path: Path, sync_s: float, robot: str, name: str, map_id: int | None = None, frozen: bool = False
-    ) -> None:
-        """Open the database; keyframes go into a new map, or are added to that of `map_id`, which may be frozen."""
+        self, path: Path, sync_s: float, robot: str, name: str, map_id: int | None = None, frozen: bool = False,
+        salvage: Salvage | None = None,
+        point_voxel: float = 0.0,
+        max_mb: float = 1000.0,
+    ) -> None:  # fmt: skip
+        """Open the database; keyframes go into a new map, or are added to that of `map_id`, which may be frozen.
+
+        On a full disk it is opened later, when there is room.
+
+        Raises:
+            StoreError: it cannot be opened for another reason.
+        """
         self.folder = path.parent
-        self._connection = open_database(path)
-        self._lock = threading.Lock()
-        self.sync_s = sync_s
-        self._queue: queue.Queue[list[_Change] | None] = queue.Queue(QUEUE_LENGTH)
-        self._late: list[_Change] = []
-        self.map_id = self._start_map(robot, name) if map_id is None else map_id
-        self._edges_seen = self._stored_edges() if map_id is not None else set()
-        self._latest: BackendResult | None = None
-        self._moved: BackendResult | None = None
-        self._poses_written: dict[int, FloatArray] = {}
-        self._weights_written: dict[EdgeKey, float] = {}
-        self._poses_time = time.monotonic()
-        self.frozen = frozen
+        self.salvage = salvage or Salvage()
         self.written = 0
         self.dropped = 0
         self.fault = ""
-        self._failed: list[_Change] = []
+        self.too_large = False
+        self.frozen = frozen
+        self._max_bytes = max_mb * 1e6
+        self._path = path
+        self._lock = threading.Lock()
+        self.sync_s = sync_s
+        self._queue: queue.Queue[list[Change] | None] = queue.Queue(QUEUE_LENGTH)
+        self._late: list[Change] = []
+        self._row = MapRow(robot, name, map_id, point_voxel, str(self.salvage))
+        self._connection: sqlite3.Connection | None = None
+        self._open_at_start()
+        self._edges_seen = edge_keys(path, map_id) if map_id is not None else set()
+        self._latest: BackendResult | None = None
+        self._moved: BackendResult | None = None
+        self._corrections = Corrections()
+        self._poses_time = time.monotonic()
+        self._failed: list[Change] = []
         self._thread = threading.Thread(target=self._run, name="store", daemon=True)
+
+    def _open_at_start(self) -> None:
+        try:
+            connection = self._opened()
+            if not self.frozen:
+                self._row.ensure(connection)
+        except (StoreFullError, sqlite3.Error) as error:
+            if isinstance(error, sqlite3.Error) and not is_full(error):
+                raise StoreError(f"[store] path = {str(self._path)!r}: {error}") from error
+            self._failing(error)
+
+    def _opened(self) -> sqlite3.Connection:
+        """The database, opened now if there was no room for it before. Raises as `open_database`."""
+        if self._connection is None:
+            if self.salvage.postponed:
+                self.salvage = check_and_salvage(self._path)
+            if self.salvage.postponed:
+                raise StoreFullError(f"no room to salvage the damaged {self._path.name}: {self.salvage.postponed}")
+            self._connection = open_database(self._path)
+        return self._connection
+
+    def _failing(self, error: Exception) -> None:
+        if not self.fault:
+            log.error("the map cannot be stored: %s; mapping goes on in memory", error)
+        self.fault = str(error)
+
+    @property
+    def map_id(self) -> int:
+        """Of the current map; 0 while there was no room to begin it."""
+        return self._row.id or 0
 
     def __enter__(self) -> MapStore:
         self._thread.start()
@@ -112,7 +125,8 @@ class MapStore:
     def __exit__(self, *_: object) -> None:
         self._queue.put(None)
         self._thread.join()
-        self._connection.close()
+        if self._connection is not None:
+            self._connection.close()
 
     def add(self, result: BackendResult, clock_offset_ns: int) -> None:
         """Keep a result's new keyframes and edges, in time its poses, and drop what left the graph; never waits."""
@@ -125,7 +139,7 @@ class MapStore:
         if result.removed:
             gone = set(result.removed)
             self._edges_seen = {key for key in self._edges_seen if key[1] not in gone and key[2] not in gone}
-        change = _Change.of(result, edges, clock_offset_ns)
+        change = Change.of(self._row, result, edges, clock_offset_ns)
         self._latest = result
         try:
             self._queue.put_nowait([*self._late, change])
@@ -141,80 +155,74 @@ class MapStore:
             poses: of the keyframes, shape (n, 4, 4).
             ids: of these keyframes; None for 0, 1, 2, ...
             edges: of the graph, whose weights may have changed.
+
+        Raises:
+            StoreError: the disk does not take them.
         """
         if self.frozen:
             return
         self._moved = None
-        self._update(poses, range(len(poses)) if ids is None else ids, edges)
+        try:
+            self._update(poses, range(len(poses)) if ids is None else ids, edges, SAVED_TOLERANCE)
+        except sqlite3.Error as error:
+            raise StoreError(f"corrected poses cannot be stored now: {error}") from error
 
-    def _update(self, poses: FloatArray, ids: Iterable[int], edges: Sequence[GraphEdge]) -> None:
-        places = dict(zip(ids, poses, strict=True))
-        moved = {k: T for k, T in places.items() if self._differs(k, T)}
-        weights: dict[EdgeKey, float] = {}
-        for e in edges:
-            # Merged keyframes may leave two closures of one name: none counts if one was taken back.
-            weights[e.kind, e.i, e.j] = min(e.weight, weights.get((e.kind, e.i, e.j), 1.0))
-        weights = {key: w for key, w in weights.items() if self._weights_written.get(key) != w}
-        pose_rows = [(_pack_pose(T), self.map_id, k) for k, T in moved.items()]
-        weight_rows = [(w, self.map_id, *key) for key, w in weights.items()]
-        with self._lock:
-            self._connection.execute("BEGIN IMMEDIATE")
-            self._connection.executemany("UPDATE keyframes SET T_map_base = ? WHERE map_id = ? AND id = ?", pose_rows)
-            self._connection.executemany(
-                "UPDATE edges SET weight = ? WHERE map_id = ? AND kind = ? AND i = ? AND j = ?", weight_rows
-            )
-            self._connection.execute("COMMIT")
-        self._poses_written.update(moved)
-        self._weights_written.update(weights)
-
-    def _differs(self, k: int, T: FloatArray) -> bool:
-        written = self._poses_written.get(k)
-        return written is None or bool(np.abs(T - written).max() > POSE_TOLERANCE)
+    def _update(self, poses: FloatArray, ids: Iterable[int], edges: Sequence[GraphEdge], tolerance: float) -> None:
+        with self._lock, transaction(self._opened()) as connection:
+            self._corrections.write(connection, self.map_id, poses, ids, edges, tolerance)
+        self._corrections.written()
 
     def rename(self, name: str) -> None:
-        """Name the current map."""
-        with self._lock:
-            self._connection.execute("UPDATE maps SET name = ? WHERE id = ?", (name, self.map_id))
+        """Name the current map. Raises StoreError where the disk does not take it."""
+        self._row.name = name
+        try:
+            with self._lock:
+                self._opened().execute("UPDATE maps SET name = ? WHERE id = ?", (name, self._row.id))
+        except sqlite3.Error as error:
+            raise StoreError(f"the name cannot be stored now: {error}") from error
 
     def new_map(self, robot: str, name: str) -> None:
         """What is added from now on belongs to a new map."""
         self.flush(self.sync_s * 2)
-        with self._lock:
-            self.map_id = self._start_map(robot, name)
+        self._row = replace(self._row, robot=robot, name=name, id=None, logged=False)
+        try:
+            with self._lock:
+                self._row.ensure(self._opened())
+        except (StoreError, sqlite3.Error) as error:
+            self._failing(error)  # the row is made with the first keyframe that the disk takes
         self.frozen = False
         self._edges_seen = set()
         self._late = []
         self._latest = self._moved = None
-        self._poses_written, self._weights_written = {}, {}
+        self._corrections = Corrections()
 
     @property
     def waiting(self) -> int:
         """Results that have not been written yet; beyond QUEUE_LENGTH they are dropped."""
         return self._queue.qsize()
 
+    @property
+    def unwritten(self) -> int:
+        """Keyframes that the disk has refused so far, and that are tried again."""
+        return sum(len(change.keyframes) for change in self._failed)
+
     def flush(self, timeout_s: float) -> bool:
-        """Wait until what was added so far is on the disk; False if it took longer."""
+        """Wait until what was added so far is on the disk; False if it took longer or the disk does not take it."""
         end = time.monotonic() + timeout_s
         while self._queue.unfinished_tasks:
             if time.monotonic() > end:
                 return False
             time.sleep(0.01)
-        return True
-
-    def _start_map(self, robot: str, name: str) -> int:
-        cursor = self._connection.execute(
-            "INSERT INTO maps (name, created_unix_ns, robot) VALUES (?, ?, ?)", (name, time.time_ns(), robot)
-        )
-        return int(cursor.lastrowid or 0)
-
-    def _stored_edges(self) -> set[EdgeKey]:
-        rows = self._connection.execute("SELECT kind, i, j FROM edges WHERE map_id = ?", (self.map_id,))
-        return {(str(kind), int(i), int(j)) for kind, i, j in rows}
+        return not self.fault
 
     def _run(self) -> None:
         stopping = False
         while not stopping:
-            item = self._queue.get()
+            try:
+                item = self._queue.get(timeout=RETRY_S if self.fault else None)
+            except queue.Empty:
+                self._write(self._failed)
+                continue
             batch = [] if item is None else list(item)
             stopping = item is None
             taken = 1
@@ -245,87 +253,48 @@ class MapStore:
             return
         self._moved, self._poses_time = None, now
         try:
-            self._update(result.poses, result.keyframe_ids, result.edges)
-        except sqlite3.Error as error:
-            if self._connection.in_transaction:
-                self._connection.execute("ROLLBACK")
+            self._update(
+                result.poses, result.keyframe_ids, result.edges, SAVED_TOLERANCE if at_once else POSE_TOLERANCE
+            )
+        except (StoreError, sqlite3.Error) as error:
             log.warning("corrected poses cannot be stored now: %s", error)
             self._moved = result
 
-    def _write(self, batch: list[_Change]) -> None:
-        if not batch:
+    def _write(self, batch: list[Change]) -> None:
+        if not batch and not self.fault:
             return
+        before = [(change.row, change.row.id, change.row.logged) for change in batch]
         try:
-            with self._lock:
-                self._connection.execute("BEGIN IMMEDIATE")
+            with self._lock, transaction(self._opened()) as connection:
                 for change in batch:
-                    self._apply(change)
-                self._connection.execute("COMMIT")
-        except sqlite3.Error as error:
+                    change.apply(connection)
+        except (StoreError, sqlite3.Error) as error:
             # The robot goes on mapping in memory; the batch is tried again with the next one.
-            if self._connection.in_transaction:
-                self._connection.execute("ROLLBACK")
-            if not self.fault:
-                log.error("the map cannot be stored: %s; mapping goes on in memory", error)
-            self.fault = str(error)
+            for row, identity, logged in before:
+                row.id, row.logged = identity, logged  # rolled back with the rest
+            self._failing(error)
             self.dropped += sum(len(change.keyframes) for change in batch[:-QUEUE_LENGTH])
             self._failed = batch[-QUEUE_LENGTH:]
             return
+        if self.fault:
+            log.warning("the map is stored again")
         self._failed = []
         self.fault = ""
         self.written += sum(len(change.keyframes) for change in batch)
-        for change in batch:
-            self._poses_written.update({keyframe.id: T for keyframe, T in change.keyframes})
-            self._weights_written.update({(e.kind, e.i, e.j): e.weight for e in change.edges})
-        gone = {key for change in batch for key in change.removed}
-        if gone:
-            self._poses_written = {k: T for k, T in self._poses_written.items() if k not in gone}
-            self._weights_written = {
-                key: w for key, w in self._weights_written.items() if key[1] not in gone and key[2] not in gone
-            }
+        self._corrections.take(batch)
+        self._keep_small()
 
-    def _apply(self, change: _Change) -> None:
-        many, map_id = self._connection.executemany, self.map_id
-        rows = [
-            (
-                map_id,
-                keyframe.id,
-                keyframe.stamp_ns + change.clock_offset_ns,
-                _pack_pose(keyframe.T_odom_base),
-                _pack_pose(T_map_base),
-                pack_points(keyframe.points),
-            )
-            for keyframe, T_map_base in change.keyframes
-        ]
-        many("INSERT OR REPLACE INTO keyframes VALUES (?, ?, ?, ?, ?, ?)", rows)
-        for merge in change.merged:
-            self._merge(merge)
-        many("UPDATE keyframes SET points = ? WHERE map_id = ? AND id = ?",
-             [(pack_points(np.zeros((0, 3))), map_id, key) for key in change.bare])  # fmt: skip
-        gone = [(map_id, key) for key in change.removed]
-        many("DELETE FROM edges WHERE map_id = ? AND j = ?", gone)
-        many("DELETE FROM edges WHERE map_id = ? AND i = ?", gone)
-        many("DELETE FROM keyframes WHERE map_id = ? AND id = ?", gone)
-        edges = [_edge_row(map_id, edge) for edge in change.edges]
-        many("INSERT INTO edges VALUES (?, ?, ?, ?, ?, ?, ?)", edges)
-
-    def _merge(self, merge: Merge) -> None:
-        """Points of a keyframe into the frame of another."""
-        execute = self._connection.execute
-        found = execute(
-            "SELECT id, points FROM keyframes WHERE map_id = ? AND id IN (?, ?)", (self.map_id, merge.into, merge.gone)
-        )
-        points = {key: unpack_points(data) for key, data in found}
-        if len(points) == 2:
-            moved = geometry.transform_points(merge.T_into_gone, points[merge.gone])
-            packed = pack_points(np.concatenate([points[merge.into], moved]))
-            execute("UPDATE keyframes SET points = ? WHERE map_id = ? AND id = ?", (packed, self.map_id, merge.into))
-
-
-def _pack_pose(T: FloatArray) -> bytes:
-    return np.asarray(geometry.to_vector7(T), dtype="<f8").tobytes()
-
-
-def _edge_row(map_id: int, edge: GraphEdge) -> tuple[int, str, int, int, bytes, bytes, float]:
-    information = edge.information[UPPER].astype("<f4").tobytes()
-    return map_id, edge.kind, edge.i, edge.j, _pack_pose(edge.T_i_j), information, edge.weight
+    def _keep_small(self) -> None:
+        """Thin the oldest sessions while the database is larger than it may be."""
+        connection = self._opened()
+        try:
+            while used_bytes(connection) > self._max_bytes:
+                with self._lock, transaction(connection):
+                    done = thin(connection, self.map_id)
+                self.too_large = not done
+                if not done:
+                    return
+                log.warning("the database is larger than [store] max_mb: %s", done)
+            self.too_large = False
+        except sqlite3.Error as error:
+            log.warning("the database cannot be thinned now: %s", error)

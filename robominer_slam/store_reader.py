@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import sqlite3
+import zlib
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +14,11 @@ from numpy.typing import NDArray
 from robominer_slam import geometry
 from robominer_slam.configuration.file import ConfigurationError
 from robominer_slam.configuration.model import SlamSection
+from robominer_slam.packed_points import unpack_points
 from robominer_slam.slam.keyframe import GraphEdge, Keyframe
 from robominer_slam.slam.saved_map import SavedMap
-from robominer_slam.store import UPPER
-from robominer_slam.store_database import StoreError, open_database, unpack_points
+from robominer_slam.store_changes import UPPER
+from robominer_slam.store_database import StoreError, open_to_read
 
 FloatArray = NDArray[np.float64]
 
@@ -58,7 +62,7 @@ def load_map(path: Path, wanted: str = "", clock_offset_ns: int = 0) -> tuple[in
     """
     if not path.exists():
         raise StoreError(f"[store] path = {str(path)!r}: is not there; expected a database with a saved map")
-    connection = open_database(path)
+    connection = _open(path)
     try:
         map_id, name = find_map(connection, wanted, str(path))
         keyframe_rows = connection.execute(
@@ -72,6 +76,15 @@ def load_map(path: Path, wanted: str = "", clock_offset_ns: int = 0) -> tuple[in
         raise StoreError(f"[store] path = {str(path)!r}: cannot be read: {error}") from error
     finally:
         connection.close()
+    try:
+        return map_id, _saved_map(keyframe_rows, edge_rows, name or str(map_id), clock_offset_ns)
+    except (zlib.error, ValueError) as error:
+        raise StoreError(f"[store] path = {str(path)!r}: a row is damaged: {error}; `run` salvages the rest") from error
+
+
+def _saved_map(
+    keyframe_rows: Sequence[Sequence[Any]], edge_rows: Sequence[Any], name: str, clock_offset_ns: int
+) -> SavedMap:
     poses = np.array([_pose(row[3]) for row in keyframe_rows])
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     travelled = np.concatenate([[0.0], np.cumsum(steps)])
@@ -81,14 +94,14 @@ def load_map(path: Path, wanted: str = "", clock_offset_ns: int = 0) -> tuple[in
     )
     known = {k.id for k in keyframes}
     edges = tuple(_edge(row) for row in edge_rows if row[1] in known and row[2] in known)
-    return map_id, SavedMap(keyframes, poses, edges, name or str(map_id))
+    return SavedMap(keyframes, poses, edges, name)
 
 
 def map_names(path: Path) -> list[tuple[int, int]]:
     """Id and time of creation (UNIX, ns) of every map with keyframes, oldest first. Raises as `load_map`."""
     if not path.exists():
         raise StoreError(f"{path}: is not there; expected a database with saved maps")
-    connection = open_database(path)
+    connection = _open(path)
     try:
         rows = connection.execute(
             "SELECT id, created_unix_ns FROM maps WHERE EXISTS (SELECT 1 FROM keyframes WHERE map_id = maps.id) "
@@ -125,14 +138,21 @@ def map_to_start_in(
 
 
 def has_maps(path: Path) -> bool:
-    """Whether a database is there and holds a map with keyframes. Raises as `open_database`."""
+    """Whether a database is there and holds a map with keyframes. Raises as `load_map`."""
     if not path.exists() or path.stat().st_size == 0:
         return False
-    connection = open_database(path)
+    connection = _open(path)
     try:
         return connection.execute("SELECT 1 FROM keyframes LIMIT 1").fetchone() is not None
     finally:
         connection.close()
+
+
+def _open(path: Path) -> sqlite3.Connection:
+    try:
+        return open_to_read(path)
+    except (OSError, sqlite3.Error) as error:
+        raise StoreError(f"[store] path = {str(path)!r}: cannot be read: {error}; expected a database") from error
 
 
 def _pose(data: bytes) -> FloatArray:

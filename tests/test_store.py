@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import sqlite3
 import time
+import zlib
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from robominer_slam import geometry
+from robominer_slam import __version__, geometry
+from robominer_slam.packed_points import pack_points, unpack_points
 from robominer_slam.slam.keyframe import BackendResult, GraphEdge, Keyframe, Merge
 from robominer_slam.store import MapStore
-from robominer_slam.store_database import StoreError, open_database, pack_points, unpack_points
+from robominer_slam.store_database import StoreError, open_database
+from robominer_slam.store_reader import load_map
+from robominer_slam.store_salvage import Salvage, check_and_salvage
 from tests.conftest import planar
 
 
@@ -44,7 +48,7 @@ def test_keyframes_and_edges_are_stored_with_their_poses(tmp_path):
     stored = rows(path, "SELECT id, stamp_unix_ns, T_map_base, points FROM keyframes ORDER BY id")
     assert [(row[0], row[1]) for row in stored] == [(k, 1007 + k) for k in range(5)]
     np.testing.assert_allclose(np.frombuffer(stored[3][2]), geometry.to_vector7(planar(0, 3.0, 0)))
-    np.testing.assert_allclose(unpack_points(stored[3][3]), result(3).keyframe.points, atol=6e-4)
+    np.testing.assert_allclose(*in_one_order(unpack_points(stored[3][3]), result(3).keyframe.points), atol=1.1e-3)
     assert rows(path, "SELECT kind, i, j FROM edges ORDER BY j") == [("odometry", i, i + 1) for i in range(4)]
 
 
@@ -55,6 +59,19 @@ def test_a_keyframe_is_on_the_disk_within_the_promised_time(tmp_path):
         end = time.monotonic() + 1.0
         while not rows(path, "SELECT id FROM keyframes"):
             assert time.monotonic() < end, "not on the disk after sync_s"
+
+
+def test_every_session_is_logged_with_what_it_found(tmp_path):
+    path = tmp_path / "map.db"
+    with MapStore(path, 0.1, "rm3", "") as store:
+        store.add(result(0), 0)
+    with MapStore(path, 0.1, "rm3", "", map_id=1, salvage=Salvage("torn", "map.db.broken")):
+        pass
+    with MapStore(path, 0.1, "rm3", "", map_id=1, frozen=True):
+        pass
+    (first, second) = rows(path, "SELECT map_id, program, found FROM sessions ORDER BY id")
+    assert first == (1, __version__, "sound")
+    assert second[2].startswith("damaged (torn), moved aside to map.db.broken")
 
 
 def test_each_run_is_a_map_of_its_own(tmp_path):
@@ -83,7 +100,7 @@ def test_what_leaves_the_graph_leaves_the_store_and_its_touches_move(tmp_path):
     stored = {row[0]: row[1:] for row in rows(path, "SELECT id, points, T_map_base FROM keyframes")}
     assert sorted(stored) == [0, 1, 3, 4]
     both = np.concatenate([result(1).keyframe.points, result(2).keyframe.points + np.array([0.1, 0.0, 0.0])])
-    np.testing.assert_allclose(unpack_points(stored[1][0]), both, atol=1.1e-3)
+    np.testing.assert_allclose(*in_one_order(unpack_points(stored[1][0]), both), atol=2.1e-3)
     assert len(unpack_points(stored[3][0])) == 0
     np.testing.assert_allclose(np.frombuffer(stored[4][1]), geometry.to_vector7(planar(0, 4.0, 0)))
 
@@ -139,4 +156,38 @@ def test_a_locked_database_is_reported_and_nothing_is_lost(tmp_path):
 
 def test_points_survive_packing_to_a_millimetre():
     points = np.random.default_rng(0).uniform(-1, 1, (500, 3))
-    np.testing.assert_allclose(unpack_points(pack_points(points)), points, atol=5.01e-4)
+    np.testing.assert_allclose(*in_one_order(unpack_points(pack_points(points)), points), atol=1.01e-3)
+    assert unpack_points(pack_points(np.zeros((0, 3)))).shape == (0, 3)
+
+
+def test_touches_of_one_cell_are_stored_as_one():
+    points = np.array([[0.001, 0.001, -0.19], [0.009, 0.011, -0.194], [0.5, 0.001, -0.19]])
+    expected = [[0.005, 0.006, -0.192], [0.5, 0.001, -0.19]]
+    np.testing.assert_allclose(*in_one_order(unpack_points(pack_points(points, 0.02)), np.array(expected)), atol=2e-3)
+
+
+def test_a_database_of_version_1_is_brought_up_to_date_and_its_touches_are_read(tmp_path):
+    path = tmp_path / "map.db"
+    with MapStore(path, 0.1, "rm3", "old") as store:
+        store.add(result(0), 0)
+    old = np.rint(result(0).keyframe.points * 1000).astype("<i2")
+    connection = sqlite3.connect(path)
+    connection.execute("UPDATE keyframes SET points = ?", (zlib.compress(old.tobytes()),))
+    connection.execute("DROP TABLE sessions")
+    connection.execute("PRAGMA user_version = 1")
+    connection.execute("PRAGMA application_id = 0")
+    connection.commit()
+    connection.close()
+    assert check_and_salvage(path).reason == ""
+    open_database(path).close()
+    assert rows(path, "PRAGMA user_version") == [(2,)]
+    assert rows(path, "SELECT * FROM sessions") == []
+    np.testing.assert_allclose(load_map(path)[1].keyframes[0].points, old / 1000)
+
+
+def in_one_order(*clouds: np.ndarray) -> list[np.ndarray]:
+    """Clouds in one order: the nearest point of the last one for each of the others' points, then the last one."""
+    last = clouds[-1]
+    ordered = [c[np.linalg.norm(c[None] - last[:, None], axis=2).argmin(axis=1)] for c in clouds[:-1]]
+    assert all(len(c) == len(last) for c in clouds)
+    return [*ordered, last]

@@ -256,6 +256,14 @@ class StoreSection(Section):
     sync_s: float = parameter(
         2.0, "s", "a keyframe is on the disk at most this long after it was made", low=0.1, high=60.0
     )
+    max_mb: float = parameter(
+        200.0, "MB", "of the database at most, 80 000 keyframes: the oldest maps are thinned then, unnamed ones first",
+        low=1.0, high=100_000.0,
+    )  # fmt: skip
+    point_voxel: float = parameter(
+        0.02, "m", "touches of a keyframe closer than this are stored as one: a cell of the search, 1 KB a keyframe",
+        low=0.0, high=0.2,
+    )  # fmt: skip
 
 
 class Configuration(Section):
