@@ -35,6 +35,8 @@ CHECK_LIMIT_S = 30.0
 CHECK_STEPS = 10_000
 #: Where the number of frames in use, and whether it is valid, are in the index of the log (https://www.sqlite.org/walformat.html).
 INDEX_FRAMES, INDEX_IS_MADE = 16, 12
+#: So much of a file tells whether it is text, bytes.
+TEXT_LOOKED_AT = 4096
 TABLES = {"maps", "keyframes", "edges"}
 
 
@@ -84,6 +86,9 @@ def check_and_salvage(path: Path) -> Salvage:
     """
     try:
         _finish_interrupted(path)
+        if _is_text(path):
+            # A slip in the configuration: somebody's file must not be moved away as a broken map.
+            raise StoreError(f"[store] path = {str(path)!r}: a text file; expected a database of ours, or no file yet")
         reason = find_damage(path)
         if not reason:
             return Salvage()
@@ -93,6 +98,24 @@ def check_and_salvage(path: Path) -> Salvage:
         raise StoreError(f"[store] path = {str(path)!r}: {error}; expected a writable folder and a database") from error
     log.error("%s: %s", path, result)
     return result
+
+
+def _is_text(path: Path) -> bool:
+    """Whether a file is somebody's text. A database is not, however damaged: its pages are full of zeros.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    if not path.exists() or path.stat().st_size == 0:
+        return False
+    with path.open("rb") as file:
+        beginning = file.read(TEXT_LOOKED_AT)
+    try:
+        # A character may be cut at the end.
+        beginning[:-4].decode("utf-8")
+    except UnicodeDecodeError:
+        return False
+    return b"\0" not in beginning
 
 
 def find_damage(path: Path) -> str:
