@@ -79,9 +79,9 @@ class DrawnDirections(DragDirection):
     def measure(
         self,
         stamp_ns: int,
-        contacts: Contacts,  # noqa: ARG002 - none are drawn
+        _contacts: Contacts,
         velocity: FloatArray,
-        covariance: FloatArray,  # noqa: ARG002
+        _covariance: FloatArray,
     ) -> DragInformation | None:
         """Sideways velocity of two places, less the estimated one."""
         # Not the true direction of motion: it would share its noise with the state.

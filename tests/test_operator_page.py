@@ -150,11 +150,27 @@ def test_a_waypoint_is_set_on_the_map(page: Page, robot: PublishedRobot):
     assert math.hypot(x - robot.pose()[0], y - robot.pose()[1]) < 3.0
 
 
+#: Points are there, and the scale bar has stayed as it is for thirty frames.
+SETTLED = """() => new Promise((settled) => {
+  let before = "", same = 0;
+  const look = () => {
+    const bar = document.querySelector(".map-scale");
+    const now = bar.innerText + bar.getBoundingClientRect().width;
+    same = now === before ? same + 1 : 0;
+    before = now;
+    if (same >= 30) settled(true); else requestAnimationFrame(look);
+  };
+  look();
+})"""
+
+
 def test_distances_and_heights_are_measured(page: Page, robot: PublishedRobot):
     page.locator("[data-testid=map] canvas").focus()
     page.keyboard.press("t")
     page.keyboard.press("a")
     page.keyboard.press("m")
+    # The view is drawn when something changed: what is clicked must be what the scale tells.
+    page.wait_for_function(SETTLED)
     box = page.locator("[data-testid=map] canvas").bounding_box()
     for share in (0.4, 0.6):
         page.mouse.click(box["x"] + share * box["width"], box["y"] + 0.5 * box["height"])

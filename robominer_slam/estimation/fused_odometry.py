@@ -69,7 +69,7 @@ class _PlanarFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has
 
     dt = 0.0
 
-    def predict_x(self, u: float = 0.0) -> None:  # noqa: ARG002 - filterpy's signature; there is no input
+    def predict_x(self, _u: float = 0.0) -> None:
         self.x: FloatArray = motion(self.x, self.dt)
 
 

@@ -200,7 +200,7 @@ class PlanarFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has 
         self._fading = 1.0
         self._effect = np.vstack([np.zeros((3, 3)), np.eye(3)])
 
-    def predict_x(self, u: float = 0.0) -> None:  # noqa: ARG002 - filterpy's signature; there is no input
+    def predict_x(self, _u: float = 0.0) -> None:
         """Move the state."""
         self.x = motion(self.x, self._inputs)
         if self._fading < 1.0:

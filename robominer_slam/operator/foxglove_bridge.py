@@ -205,7 +205,7 @@ def _listener(on_topic: Callable[[str], None]) -> ServerListener:
     from foxglove.websocket import ChannelView, Client, ServerListener
 
     class Subscriptions(ServerListener):
-        def on_subscribe(self, client: Client, channel: ChannelView) -> None:  # noqa: ARG002
+        def on_subscribe(self, _client: Client, channel: ChannelView) -> None:
             on_topic(channel.topic)
 
     return Subscriptions()

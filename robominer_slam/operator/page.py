@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from html import escape
-from typing import Any
 
 from nicegui import events, ui
 
@@ -93,7 +92,7 @@ def _figures(rows: tuple[tuple[str, str], ...], follows: str = "link") -> None:
             ui.element("dd").props(f"data-field={name}")
 
 
-def _card(title: str) -> Any:  # noqa: ANN401 - NiceGUI's elements are context managers of their own type
+def _card(title: str) -> ui.element:
     card = ui.element("section").classes("card").props(f'aria-label="{title}"')
     with card:
         ui.html(f"<h2>{title}</h2>", sanitize=False)
