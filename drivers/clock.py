@@ -1,8 +1,8 @@
 """A device's clock mapped to the host's monotonic clock by PING/PONG round trips.
 
 Each round trip bounds the offset: the device answered between sending and receiving, so the midpoint errs by at
-most half the trip. A line (offset and drift) is fitted through the midpoints of the quicker trips; arrival times
-of measurements, bursty over USB, are never used. The idea of regression over round trips with an ageing minimum
+most half the trip. A line (offset and drift) is fitted through the midpoints, each weighted by its bound; arrival
+times of measurements, bursty over USB, are never used. The idea of regression over round trips with an ageing minimum
 is that of Klipper's clock synchronisation.
 """
 
@@ -20,9 +20,8 @@ WINDOW = 32
 MIN_DRIFT_SPAN_NS = 5_000_000_000
 #: Crystals are good to 100 ppm; what deviates more is noise or a jump.
 MAX_DRIFT = 500e-6
-#: Round trips slower than this many times the quickest (plus slack) are kept out of the fit.
-SLOW_TRIP_FACTOR = 2.0
-SLOW_TRIP_SLACK_NS = 200_000
+#: A trip's bound is taken as no smaller than this: clocks tick in microseconds and threads are not quicker.
+LEAST_HALF_TRIP_NS = 20_000
 #: A midpoint that misses the line by more than this beyond its own bound: the device's clock jumped.
 JUMP_NS = 20_000_000
 
@@ -42,7 +41,7 @@ class DeviceClock:
     Attributes:
         jumps: how often the device's clock jumped (a restart of the device, mostly).
         drift: estimated rate error of the device's clock, dimensionless.
-        uncertainty_ns: half the quickest trip in the window; the mapping's bound.
+        uncertainty_ns: the mapping's bound: the trips' own bounds, in the mean that the fit takes of their midpoints.
     """
 
     def __init__(self) -> None:
@@ -108,22 +107,24 @@ class DeviceClock:
         return self._reference_ns + round(elapsed_us * 1000 * (1.0 + self.drift))
 
     def _fit(self) -> None:
-        quickest = min(trip.half_trip_ns for trip in self._trips)
-        limit = quickest * SLOW_TRIP_FACTOR + SLOW_TRIP_SLACK_NS
-        good = [trip for trip in self._trips if trip.half_trip_ns <= limit]
-        device = np.array([trip.device_us - good[0].device_us for trip in good], dtype=np.float64) * 1000.0
-        host = np.array([trip.host_ns - good[0].host_ns for trip in good], dtype=np.float64)
+        first = self._trips[0]
+        device = np.array([trip.device_us - first.device_us for trip in self._trips], dtype=np.float64) * 1000.0
+        host = np.array([trip.host_ns - first.host_ns for trip in self._trips], dtype=np.float64)
+        bound = np.array([max(trip.half_trip_ns, LEAST_HALF_TRIP_NS) for trip in self._trips], dtype=np.float64)
+        # A trip that took four times as long counts a sixteenth: on a busy machine one quick trip outweighs all others.
+        weight = bound**-2 / np.sum(bound**-2)
         residual = host - device
-        span = device[-1] - device[0]
+        mean_device = float(weight @ device)
+        mean_residual = float(weight @ residual)
         slope = 0.0
-        if span >= MIN_DRIFT_SPAN_NS:
-            centred = device - device.mean()
-            slope = float(centred @ (residual - residual.mean()) / (centred @ centred))
+        centred = device - mean_device
+        # Trips that were quick enough to be trusted, not the slow ones at the ends, must span the time.
+        spread = float(weight @ centred**2)
+        if device[-1] - device[0] >= MIN_DRIFT_SPAN_NS and 12.0 * spread >= MIN_DRIFT_SPAN_NS**2:
+            slope = float(weight @ (centred * (residual - mean_residual))) / spread
             slope = min(max(slope, -MAX_DRIFT), MAX_DRIFT)
         self.drift = slope
-        mean_device = float(device.mean())
-        mean_residual = float(residual.mean())
-        self._reference_us = good[0].device_us + round(mean_device / 1000.0)
-        rounded = (self._reference_us - good[0].device_us) * 1000.0
-        self._reference_ns = good[0].host_ns + round(rounded + mean_residual)
-        self.uncertainty_ns = quickest
+        self._reference_us = first.device_us + round(mean_device / 1000.0)
+        rounded = (self._reference_us - first.device_us) * 1000.0
+        self._reference_ns = first.host_ns + round(rounded + mean_residual)
+        self.uncertainty_ns = round(float(weight @ bound))

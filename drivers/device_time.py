@@ -18,8 +18,10 @@ from drivers.readings import Decoder, HallReading, PongReading, Reading, ScrewRe
 from drivers.rm3_values import values_per_sensor
 from drivers.settings import DeviceSettings
 
-#: At first eight quick round trips, so that measurements are stamped 0.2 s after opening; then one a second.
-FIRST_PINGS = 8
+#: At first eight quick round trips, so that measurements are stamped 0.2 s after opening; then one a second. Where a
+#: busy machine made them all slow, more of them, for a few seconds.
+FIRST_PINGS, MOST_FIRST_PINGS = 8, 200
+SURE_ENOUGH_NS = 1_000_000
 FIRST_PING_INTERVAL_NS = 25_000_000
 PING_INTERVAL_NS = 1_000_000_000
 #: Intervals vary by this share either way. A device whose loop looks at its port every 10 ms, after it has sent, would
@@ -91,7 +93,7 @@ class AskedTime:
 
     @property
     def uncertainty_ns(self) -> int:
-        """Half the quickest round trip, ns."""
+        """Bound of the mapping, ns: the round trips' own bounds, in the mean that it takes of them."""
         return self.clock.uncertainty_ns
 
     @property
@@ -115,7 +117,8 @@ class AskedTime:
         """A PING when one is due."""
         if now_ns < self._next_ping_ns:
             return b""
-        quick = self._ping_count < FIRST_PINGS or not self.clock.synchronised
+        unsure = self.clock.uncertainty_ns > SURE_ENOUGH_NS and self._ping_count < MOST_FIRST_PINGS
+        quick = self._ping_count < FIRST_PINGS or not self.clock.synchronised or unsure
         interval = FIRST_PING_INTERVAL_NS if quick else PING_INTERVAL_NS
         spread = 2.0 * (self._ping_count * GOLDEN_RATIO % 1.0) - 1.0
         self._next_ping_ns = now_ns + round(interval * (1.0 + PING_SPREAD * spread))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from drivers.clock import WRAP_US, DeviceClock
 
@@ -54,3 +56,24 @@ def test_measurement_older_than_the_last_trip_maps_backwards():
     clock = DeviceClock()
     clock.add_round_trip(1_000_000_000, 1_000_000_000, 7_000_000)
     assert clock.to_host_ns(6_960_000) == 960_000_000
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 30_000), st.integers(0, 30_000)), min_size=1, max_size=20))
+def test_the_mapping_is_within_the_bound_that_it_states_however_slow_and_lopsided_the_trips(delays_us):
+    clock = DeviceClock()
+    for index, (there_us, back_us) in enumerate(delays_us):
+        sent_ns = index * 25_000_000
+        clock.add_round_trip(sent_ns, sent_ns + (there_us + back_us) * 1000, 1_000_000 + sent_ns // 1000 + there_us)
+    if clock.jumps == 0:
+        assert abs(clock.to_host_ns(1_000_000)) <= clock.uncertainty_ns + 2000
+
+
+def test_one_quick_trip_outweighs_many_slow_ones():
+    clock = DeviceClock()
+    for index in range(20):
+        sent_ns = index * 25_000_000
+        there_us, back_us = (50, 50) if index == 7 else (8000, 100)
+        clock.add_round_trip(sent_ns, sent_ns + (there_us + back_us) * 1000, sent_ns // 1000 + there_us)
+    assert abs(clock.to_host_ns(0)) < 50_000
+    assert clock.uncertainty_ns < 100_000
