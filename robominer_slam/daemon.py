@@ -27,6 +27,7 @@ from robominer_slam.publishing.report_messages import Diagnostic
 from robominer_slam.publishing.telemetry import Health
 from robominer_slam.publishing.zenoh_session import ZenohBus
 from robominer_slam.remote_status import RemoteStatus, short_status
+from robominer_slam.saved_maps import SavedMaps
 from robominer_slam.slam.saved_map import SavedMap
 from robominer_slam.sources.source import MeasurementSource
 from robominer_slam.status_words import slam_words
@@ -75,6 +76,7 @@ class Daemon:
         slam = configuration.slam
         relocalisation = slam.robust.relocalisation if slam.method == "robust" else None
         self._commands = Commands(self._pipeline, self._map, store, self._new_map, relocalisation)
+        self._saved_maps = SavedMaps(store.path, lambda: store.map_id, configuration.map.stream_cell)
         self._remote_status = RemoteStatus()
         self._last_frame: FrameResult | None = None
         self._telemetry_ns = self._status_ns = self._telemetry_count = 0
@@ -206,10 +208,12 @@ class Daemon:
             "map/cloud": lambda _: service.cloud(),
             "map/grid": lambda _: service.grid(),
             "map/graph": lambda _: service.graph(),
+            "map/closures": service.closures,
             "cmd/*": self._commands.handle,
         }
         for key, handler in handlers.items():
             self._bus.queryable(key, self._locked(handler))
+        self._bus.queryable("map/saved", self._saved_maps.answer)
 
     def _locked(self, handler: Callable[[Query], list[Reply]]) -> Callable[[Query], list[Reply]]:
         def answer(query: Query) -> list[Reply]:

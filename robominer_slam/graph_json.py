@@ -1,4 +1,4 @@
-"""The pose graph as the JSON of `map/graph`."""
+"""The pose graph as the JSON of `map/graph`, and its loop closures alone as that of `map/closures`."""
 
 from __future__ import annotations
 
@@ -10,6 +10,16 @@ from robominer_slam import geometry
 from robominer_slam.mapping.keyframe_map import KeyframeMap
 
 UPPER = np.triu_indices(6)
+#: Closures in one answer: below what a slow link carries at once.
+MOST_CLOSURES = 500
+
+
+def closures_json(keyframe_map: KeyframeMap, first: int) -> str:
+    """At most 500 pairs of keyframe ids, from a first one on: {"version", "total", "first", "pairs": [[i, j], ...]}."""
+    pairs = [[edge.i, edge.j] for edge in keyframe_map.edges if edge.kind == "loop"]
+    part = pairs[first : first + MOST_CLOSURES]
+    answer = {"version": keyframe_map.version, "total": len(pairs), "first": first, "pairs": part}
+    return json.dumps(answer, separators=(",", ":"))
 
 
 def graph_json(keyframe_map: KeyframeMap, clock_offset_ns: int) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from robominer_slam import geometry
 from robominer_slam.configuration.model import MapSection
 from robominer_slam.frame_result import FrameResult
-from robominer_slam.graph_json import graph_json
+from robominer_slam.graph_json import closures_json, graph_json
 from robominer_slam.mapping.height_grid import GridSizeError, height_grid, occupancy
 from robominer_slam.mapping.keyframe_map import KeyframeMap
 from robominer_slam.publisher import MAP
@@ -107,6 +107,17 @@ class MapService:
         cells = np.ascontiguousarray(occupancy(grid, self.section.obstacle_height))
         message = report_messages.occupancy_grid(self._clock.now_unix_ns(), MAP, grid.cell, grid.origin, cells)
         return [Reply(message)]
+
+    def closures(self, query: Query) -> list[Reply]:
+        """The loop closures' ends as JSON, in portions: those from `first=` on.
+
+        Raises:
+            QueryRefusedError: a parameter that means nothing.
+        """
+        first = query.parameters.get("first", "0")
+        if not first.isdecimal():
+            raise QueryRefusedError("expected a whole number in first=")
+        return [Reply(closures_json(self.keyframe_map, int(first)).encode())]
 
     def graph(self) -> list[Reply]:
         """The pose graph as JSON."""

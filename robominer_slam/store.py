@@ -72,7 +72,7 @@ class MapStore:
         self.too_large = False
         self.frozen = frozen
         self._max_bytes = max_mb * 1e6
-        self._path = path
+        self.path = path
         self._lock = threading.Lock()
         self.sync_s = sync_s
         self._queue: queue.Queue[list[Change] | None] = queue.Queue(QUEUE_LENGTH)
@@ -95,17 +95,17 @@ class MapStore:
                 self._row.ensure(connection)
         except (StoreFullError, sqlite3.Error) as error:
             if isinstance(error, sqlite3.Error) and not is_full(error):
-                raise StoreError(f"[store] path = {str(self._path)!r}: {error}") from error
+                raise StoreError(f"[store] path = {str(self.path)!r}: {error}") from error
             self._failing(error)
 
     def _opened(self) -> sqlite3.Connection:
         """The database, opened now if there was no room for it before. Raises as `open_database`."""
         if self._connection is None:
             if self.salvage.postponed:
-                self.salvage = check_and_salvage(self._path)
+                self.salvage = check_and_salvage(self.path)
             if self.salvage.postponed:
-                raise StoreFullError(f"no room to salvage the damaged {self._path.name}: {self.salvage.postponed}")
-            self._connection = open_database(self._path)
+                raise StoreFullError(f"no room to salvage the damaged {self.path.name}: {self.salvage.postponed}")
+            self._connection = open_database(self.path)
         return self._connection
 
     def _failing(self, error: Exception) -> None:

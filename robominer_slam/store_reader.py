@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 import zlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -97,21 +98,31 @@ def _saved_map(
     return SavedMap(keyframes, poses, edges, name)
 
 
-def map_names(path: Path) -> list[tuple[int, int]]:
-    """Id and time of creation (UNIX, ns) of every map with keyframes, oldest first. Raises as `load_map`."""
+@dataclass(frozen=True, slots=True)
+class MapEntry:
+    """A saved map in the list of them: number, name, time of creation (UNIX, ns), how many keyframes."""
+
+    number: int
+    name: str
+    created_unix_ns: int
+    keyframes: int
+
+
+def maps_in(path: Path) -> list[MapEntry]:
+    """Every map with keyframes, oldest first. Raises as `load_map`."""
     if not path.exists():
         raise StoreError(f"{path}: is not there; expected a database with saved maps")
     connection = _open(path)
     try:
         rows = connection.execute(
-            "SELECT id, created_unix_ns FROM maps WHERE EXISTS (SELECT 1 FROM keyframes WHERE map_id = maps.id) "
-            "ORDER BY id"
+            "SELECT maps.id, name, created_unix_ns, count(*) FROM maps JOIN keyframes ON map_id = maps.id "
+            "GROUP BY maps.id ORDER BY maps.id"
         ).fetchall()
     except sqlite3.Error as error:
         raise StoreError(f"{path}: cannot be read: {error}") from error
     finally:
         connection.close()
-    return [(int(number), int(created)) for number, created in rows]
+    return [MapEntry(int(number), str(name), int(created), int(count)) for number, name, created, count in rows]
 
 
 def map_to_start_in(

@@ -24,6 +24,14 @@ FLAGS = [
     "--disable-component-update", "--disable-sync", "--use-gl=angle", "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
 ]  # fmt: skip
+#: A browser that cannot draw in 3D.
+NO_GRAPHICS = [
+    "--no-sandbox",
+    "--no-first-run",
+    "--disable-gpu",
+    "--disable-3d-apis",
+    "--disable-background-networking",
+]
 PATIENCE_MS = 20_000
 
 
@@ -67,13 +75,13 @@ def address_of(process: subprocess.Popen[bytes], log: Path) -> str:
 
 
 @contextlib.contextmanager
-def browser() -> Iterator[Browser]:
-    """Chromium of the system. Where it is missing a test may be skipped by hand, never in CI."""
+def browser(*flags: str) -> Iterator[Browser]:
+    """Chromium of the system, with flags in place of ours. Where it is missing a test may be skipped, never in CI."""
     if not Path(CHROMIUM).exists():
         assert not os.environ.get("ROBOMINER_SLAM_CI"), "chromium is missing: apt-get install chromium"
         pytest.skip("chromium is missing: apt-get install chromium")
     with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, headless=True, args=FLAGS)
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, headless=True, args=[*(flags or FLAGS)])
         yield chromium
         chromium.close()
 

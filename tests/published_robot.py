@@ -7,6 +7,7 @@ import math
 import threading
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from robominer_slam.publishing.pose_messages import StampedTransform
 from robominer_slam.publishing.report_messages import Diagnostic, Level
 from robominer_slam.publishing.telemetry import Health, Telemetry, encode
 from robominer_slam.publishing.zenoh_session import ZenohBus, ZenohSettings
+from robominer_slam.saved_maps import SavedMaps
 
 RATE_HZ = 25
 RADIUS_M = 1.0
@@ -57,6 +59,7 @@ class PublishedRobot:
         bend: inclination (rad) of whiskers that touch, by index.
         faults: whiskers that are left out, by index: as `status` says it.
         commands: what was asked for, in order: name and parameters.
+        database: of saved maps; None: this robot has no store.
         obeys: whether commands are answered at all.
     """
 
@@ -78,6 +81,7 @@ class PublishedRobot:
         self.obeys = True
         self.waypoints: list[tuple[float, float]] = []
         self.simulated = False
+        self.database: Path | None = None
         self.state = "tracking"
         self.layout: WhiskerLayout = thesis_grid()
         self.lock = threading.Lock()
@@ -110,7 +114,9 @@ class PublishedRobot:
         ]
         self._bus.latch("tf_static", pose_messages.transforms(transforms))
         self._bus.queryable("map/snapshot", lambda _: self._snapshot())
-        self._bus.queryable("map/graph", lambda _: Reply(self._graph()))
+        self._bus.queryable("map/closures", lambda query: Reply(self._closures(int(query.parameters["first"]))))
+        if self.database is not None:
+            self._bus.queryable("map/saved", SavedMaps(self.database, lambda: 1, None).answer)
         if self.obeys:
             self._bus.queryable("cmd/*", self._command)
         if self.simulated:
@@ -131,9 +137,10 @@ class PublishedRobot:
             messages = self._encoder.snapshot()
         return [Reply(b"".join(messages[k : k + 100])) for k in range(0, len(messages), 100)]
 
-    def _graph(self) -> bytes:
+    def _closures(self, first: int) -> bytes:
+        """Three to an answer."""
         with self.lock:
-            return json.dumps({"edges": [{"kind": "loop", "i": i, "j": j} for i, j in self.closures]}).encode()
+            return json.dumps({"total": len(self.closures), "pairs": self.closures[first : first + 3]}).encode()
 
     def _command(self, query: Query) -> Reply:
         name = query.key.rsplit("/", 1)[-1]

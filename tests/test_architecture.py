@@ -160,7 +160,7 @@ def test_simulation_only_libraries_stay_in_the_simulator():
 
 #: Of the operator's console: what lays out and serves the page, and what is below it.
 PAGE = {
-    "command_panel", "components", "page", "web_server", "whisker_history", "access", "stream",
+    "command_panel", "components", "page", "web_server", "whisker_history", "saved_maps_panel", "access", "stream",
 }  # fmt: skip
 WEB_MODULES = {"nicegui", "fastapi", "starlette", "uvicorn"}
 

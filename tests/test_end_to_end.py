@@ -25,7 +25,9 @@ from robominer_slam.cli.main import cli
 from robominer_slam.evaluation.metrics import trajectory_errors
 from robominer_slam.evaluation.pose_graph_errors import closure_errors
 from robominer_slam.evaluation.trajectory import Trajectory
+from robominer_slam.operator import saved_maps
 from robominer_slam.publishing import telemetry
+from robominer_slam.publishing.map_state import MapState
 from robominer_slam.publishing.map_stream import MapStreamDecoder
 from robominer_slam.publishing.zenoh_session import QueryError, ZenohBus, ZenohSettings
 from sim_backend.demo import free_port, program
@@ -108,6 +110,9 @@ class Drive:
     cloud_points: int
     snapshot: list[bytes]
     last_status: dict[str, dict[str, str]]
+    closures: dict
+    listed: list[saved_maps.SavedMapEntry]
+    fetched: MapState
     folder: Path
     exit_code: int
     log: str
@@ -155,6 +160,11 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
                     heard.status.get()
                 last_status = heard.status.get(timeout=5)
                 updates = list(heard.updates)
+                closures = json.loads(ask(bus, "map/closures"))
+                listed = saved_maps.listed(bus)
+                fetched = saved_maps.fetch(bus, listed[0].number)
+                with pytest.raises(QueryError, match="the robot has none such"):
+                    saved_maps.fetch(bus, 99)
                 assert json.loads(bus.get("cmd/new_map", {"id": "4"})[0].payload)["ok"]
                 assert json.loads(bus.get("cmd/new_map", {"id": "4"})[0].payload)["ok"]
                 new_graph = json.loads(ask(bus, "map/graph"))
@@ -168,13 +178,28 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
                     process.kill()
                     process.wait()
     return Drive(
-        heard, read_tum(Path(ready["truth"])), graph, int(cloud.width), snapshot, last_status, folder, exit_code,
+        heard, read_tum(Path(ready["truth"])), graph, int(cloud.width), snapshot, last_status, closures, listed,
+        fetched, folder, exit_code,
         (folder / "run.log").read_text(), commands, str(bad_query.value), updates, new_graph,
     )  # fmt: skip
 
 
 def ask(bus: ZenohBus, key: str) -> bytes:
     return bus.get(key, timeout_s=10.0)[0].payload
+
+
+def test_saved_maps_are_listed_and_fetched_and_closures_told(drive: Drive):
+    [entry] = drive.listed
+    assert (entry.name, entry.present) == ("test", True)
+    assert entry.keyframes >= len(drive.graph["keyframes"])
+    # Read back from the disk it is the map that was heard, in the same frame.
+    heard = {one["id"]: np.array(one["pose"][:3]) for one in drive.graph["keyframes"]}
+    assert drive.fetched.keyframes.keys() >= heard.keys()
+    assert max(np.abs(drive.fetched.keyframes[key].vector7()[:3] - place).max() for key, place in heard.items()) < 0.02
+    assert len(drive.fetched.cloud()) > 0.1 * drive.cloud_points
+    loops = [[edge["i"], edge["j"]] for edge in drive.graph["edges"] if edge["kind"] == "loop"]
+    assert drive.closures["pairs"][: len(loops)] == loops
+    assert drive.closures["total"] >= len(loops)
 
 
 def test_poses_are_near_the_truth_and_every_frame_has_one(drive: Drive):

@@ -16,6 +16,7 @@ from robominer_slam.operator.readings import ProcessorMeter, place_fields, readi
 from robominer_slam.operator.robot_view import RobotView
 from robominer_slam.operator.session_history import SessionHistory
 from robominer_slam.operator.status_entries import StatusEntry, faults_in_words, whisker_faults
+from robominer_slam.operator.status_history import PastStatus, StatusHistory
 from robominer_slam.operator.traffic import Traffic
 from robominer_slam.publishing import map_state, pose_messages
 from robominer_slam.publishing.map_state import MapState
@@ -185,3 +186,16 @@ def test_readings_of_a_view_that_has_heard_nothing():
     meter = ProcessorMeter()
     assert math.isnan(meter.share(1.0, 0.0))
     assert meter.share(1.5, 1.0) == pytest.approx(50.0)
+
+
+def test_what_the_robot_said_is_found_again_in_bounded_memory():
+    history = StatusHistory(capacity=100)
+    for k in range(1000):
+        entry = StatusEntry("store", Level.WARN if k == 990 else Level.OK, f"said at {k}", {"disk.free_MB": str(k)})
+        history.add(PastStatus(k * 10**9, (entry,), Health.PAUSED if k == 990 else Health.FINE))
+    assert len(history) <= 100
+    assert history.at(-1) is None
+    first, late = history.at(0), history.at(990 * 10**9 + 5)
+    assert (first.entries[0].message, late.entries[0].message) == ("said at 0", "said at 990")
+    assert (late.entries[0].level, late.health) == (Level.WARN, Health.PAUSED)
+    assert history.before(990 * 10**9 + 5).entries[0].values == {"disk.free_MB": "989"}

@@ -16,7 +16,7 @@ from robominer_slam.map_files.octomap import OctomapSizeError
 from robominer_slam.mapping.height_grid import GridSizeError
 from robominer_slam.replay_session import split_name
 from robominer_slam.slam.saved_map import SavedMap
-from robominer_slam.store_reader import load_map, map_names
+from robominer_slam.store_reader import load_map, maps_in
 
 MAP = "DATABASE[:NAME]"
 #: What `map info` tells of each map, and how a person reads it.
@@ -43,7 +43,7 @@ def map_group() -> None:
 def info(database: Path, as_json: bool) -> None:
     """What maps a database holds."""
     entries = [
-        _described(number, created, load_map(database, str(number))[1]) for number, created in map_names(database)
+        _described(one.number, one.created_unix_ns, load_map(database, str(one.number))[1]) for one in maps_in(database)
     ]
     if as_json:
         click.echo(json.dumps({"database": str(database), "bytes": database.stat().st_size, "maps": entries}))

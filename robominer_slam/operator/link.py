@@ -16,12 +16,14 @@ from types import TracebackType
 from uuid import uuid4
 
 from drivers.ros_messages import MessageError
-from robominer_slam.operator import array_model, live_frame, status_entries
+from robominer_slam.operator import array_model, live_frame, saved_maps, status_entries
 from robominer_slam.operator.commands import CommandResult, Outcome, result_of
 from robominer_slam.operator.robot_view import RobotView
+from robominer_slam.operator.saved_maps import SavedMapEntry
 from robominer_slam.publishing import telemetry
 from robominer_slam.publishing.bus_messages import QueryError, Received
 from robominer_slam.publishing.map_receiver import MapReceiver
+from robominer_slam.publishing.map_state import MapState
 from robominer_slam.publishing.zenoh_session import ZenohBus, ZenohSettings
 
 log = logging.getLogger(__name__)
@@ -33,8 +35,8 @@ QUERY_TIMEOUT_S = 5.0
 TICK_S = 0.2
 #: What is asked for and does not come is asked for again after this long, s.
 RETRY_S = 2.0
-#: The graph is asked for at most so often: it is large, and the link may be slow.
-GRAPH_INTERVAL_S = 3.0
+#: The closures are asked for at most so often: they may be many, and the link slow.
+CLOSURES_INTERVAL_S = 3.0
 SIMULATOR_INTERVAL_S = 3.0
 
 #: Keys that tell where the robot is.
@@ -67,7 +69,7 @@ class RobotLink:
         self._stop = threading.Event()
         self._due: dict[str, float] = {}
         self._mounts_known = False
-        self._graph_of: tuple[int, int] | None = None
+        self._closures_of: tuple[int, int] | None = None
         self._bus = ZenohBus(settings, f"robominer/{robot}")
         self._receiver = MapReceiver(self._bus, self.view.take_map)
         handlers = {
@@ -125,13 +127,21 @@ class RobotLink:
         self.view.note(f"command {name}: {result.outcome.value}: {result.message}")
         return result
 
-    def graph(self) -> bytes:
-        """The pose graph as the robot tells it, JSON.
+    def saved_maps(self) -> list[SavedMapEntry]:
+        """Maps on the robot's disk, the newest first; waits for its answer.
 
         Raises:
             QueryError: no answer.
         """
-        return self._bus.get("map/graph", timeout_s=QUERY_TIMEOUT_S)[0].payload
+        return saved_maps.listed(self._bus)
+
+    def saved_map(self, number: int) -> MapState:
+        """One of them; waits until it is here.
+
+        Raises:
+            QueryError: it did not come.
+        """
+        return saved_maps.fetch(self._bus, number, lambda: not self._stop.is_set())
 
     def _counted(self, handler: Callable[[Received], None]) -> Callable[[Received], None]:
         def take(received: Received) -> None:
@@ -173,8 +183,8 @@ class RobotLink:
             self._receiver.tick()
             if not self._mounts_known:
                 self._try("mounts", RETRY_S, self._ask_mounts)
-            if heard is not None and self._graph_wanted(heard.closures):
-                self._try("graph", GRAPH_INTERVAL_S, self._ask_graph)
+            if heard is not None and self._closures_wanted(heard.closures):
+                self._try("closures", CLOSURES_INTERVAL_S, self._ask_closures)
             self._try("simulator", SIMULATOR_INTERVAL_S, self._ask_simulator)
 
     def _try(self, name: str, interval_s: float, ask: Callable[[], None]) -> None:
@@ -197,16 +207,21 @@ class RobotLink:
             self._mounts_known = True
             self.view.take_layout(layout)
 
-    def _graph_wanted(self, closures: int) -> bool:
-        return self._graph_of != (self.view.map.map_id, closures)
+    def _closures_wanted(self, closures: int) -> bool:
+        return self._closures_of != (self.view.map.map_id, closures)
 
-    def _ask_graph(self) -> None:
+    def _ask_closures(self) -> None:
         heard = self.view.telemetry
         asked = (self.view.map.map_id, 0 if heard is None else heard.closures)
-        # One that is too large for a remote link does not come, and is not asked for again until it has changed.
-        self._graph_of = asked
-        edges = json.loads(self.graph())["edges"]
-        self.view.take_closures([(edge["i"], edge["j"]) for edge in edges if edge["kind"] == "loop"])
+        pairs: list[tuple[int, int]] = []
+        total = 1
+        while len(pairs) < total:
+            reply = self._bus.get("map/closures", {"first": str(len(pairs))}, timeout_s=QUERY_TIMEOUT_S)[0]
+            answer = json.loads(reply.payload)
+            total = answer["total"] if answer["pairs"] else 0
+            pairs += [(i, j) for i, j in answer["pairs"]]
+        self.view.take_closures(pairs)
+        self._closures_of = asked
 
     def _ask_simulator(self) -> None:
         try:

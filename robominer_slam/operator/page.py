@@ -8,6 +8,7 @@ from nicegui import events, ui
 
 from robominer_slam.operator.command_panel import CommandPanel
 from robominer_slam.operator.components import STATIC, Keyboard, MapView, ReadOuts, TimeLine, WhiskerPanel
+from robominer_slam.operator.saved_maps_panel import SavedMapsPanel
 from robominer_slam.operator.session import Session
 from robominer_slam.operator.whisker_history import WhiskerHistory
 
@@ -141,6 +142,8 @@ def _side(session: Session) -> CommandPanel:
                 panel.map_commands()
             with _card("Export"):
                 _exports()
+            with _card("Saved maps"):
+                SavedMapsPanel(session)
             with _card("Log"):
                 ui.element("ul").props("id=events data-testid=events").classes("list")
     history = WhiskerHistory(session.view)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from robominer_slam import geometry
 from robominer_slam.operator.live_frame import LiveFrame
 from robominer_slam.operator.robot_view import RobotView
 from robominer_slam.operator.status_entries import StatusEntry, faults_in_words, whisker_faults
+from robominer_slam.publishing.telemetry import Health
 
 NOTHING = "–"
 #: Beyond this the place counts as unknown, m.
@@ -102,9 +103,9 @@ class ProcessorMeter:
         return self._share
 
 
-def robot_fields(view: RobotView, meter: ProcessorMeter, now_s: float) -> dict[str, str]:
-    """The robot's computer: CPU, memory, disk, clock."""
-    entries = {entry.name: entry for entry in view.status}
+def robot_fields(status: Sequence[StatusEntry], meter: ProcessorMeter, now_s: float) -> dict[str, str]:
+    """The robot's computer: CPU, memory, disk, clock; `now_s` is when the status was made, by any clock."""
+    entries = {entry.name: entry for entry in status}
     process, store = _values(entries, "process"), _values(entries, "store")
     cpu = math.nan if "cpu_s" not in process else meter.share(float(process["cpu_s"]), now_s)
     offset = process.get("clock.offset_ns")
@@ -124,29 +125,53 @@ def robot_fields(view: RobotView, meter: ProcessorMeter, now_s: float) -> dict[s
     }
 
 
-def devices(view: RobotView) -> list[list[str]]:
+def devices(status: Sequence[StatusEntry]) -> list[list[str]]:
     """Name, state in words and how bad it is (0 to 3), of each device."""
     return [
         [entry.name.removeprefix("device/"), entry.message, str(int(entry.level))]
-        for entry in view.status
+        for entry in status
         if entry.name.startswith("device/")
     ]
 
 
-def readings(view: RobotView, meter: ProcessorMeter) -> dict[str, object]:
-    """All fields, the faults, and the whiskers' health; holds the view's lock."""
+def _past(view: RobotView, stamp_ns: int) -> tuple[Sequence[StatusEntry], Health, dict[str, str]]:
+    """What the robot said at a moment of the session, and the fields of its computer then."""
+    status, before = view.status_history.at(stamp_ns), view.status_history.before(stamp_ns)
+    if status is None:
+        return (), Health.FINE, robot_fields((), ProcessorMeter(), 0.0)
+    meter = ProcessorMeter()
+    if before is not None:
+        robot_fields(before.entries, meter, before.stamp_ns * 1e-9)
+    return status.entries, status.health, robot_fields(status.entries, meter, status.stamp_ns * 1e-9)
+
+
+def readings(view: RobotView, meter: ProcessorMeter, seek_ns: int | None = None) -> dict[str, object]:
+    """All fields, the faults, and the whiskers' health; holds the view's lock.
+
+    Args:
+        view: what is known.
+        meter: of the robot's CPU, now.
+        seek_ns: the moment that is looked at, UNIX ns: what the robot said of itself is of then, the link's figures
+            are always of now; None: now.
+    """
     with view.lock:
         now = time.monotonic()
         cols = view.layout.cols if view.layout is not None else 1
-        fields = link_fields(view, now) | map_fields(view) | robot_fields(view, meter, now)
+        # A recording has one status, which tells how its reading went.
+        if seek_ns is None or view.progress is not None:
+            status, health, computer = view.status, view.health(), robot_fields(view.status, meter, now)
+        else:
+            status, health, computer = _past(view, seek_ns)
+        fields = link_fields(view, now) | map_fields(view) | computer
         return {
             "fields": fields,
-            "faults": faults_in_words(view.status, view.health()),
-            "whiskers": whisker_faults(view.status, cols),
-            "devices": devices(view),
+            "faults": faults_in_words(status, health),
+            "whiskers": whisker_faults(status, cols),
+            "devices": devices(status),
             "events": [[event.stamp_ns // 1_000_000, event.text] for event in list(view.events)[-50:]],
             "age": view.traffic.live_age_s(now),
-            "status_age": view.traffic.age_s("status", now),
+            # What was said then is not stale: it is what is looked at.
+            "status_age": view.traffic.age_s("status", now) if seek_ns is None else 0.0,
             "progress": view.progress,
             "waypoints": view.waypoints,
             "paused": bool(view.health() & view.health().PAUSED),

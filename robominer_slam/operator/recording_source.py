@@ -16,7 +16,10 @@ from robominer_slam.mapping.keyframe_map import KeyframeMap
 from robominer_slam.operator.commands import CommandResult, Outcome
 from robominer_slam.operator.live_frame import LiveFrame
 from robominer_slam.operator.robot_view import RobotView
+from robominer_slam.operator.saved_maps import SavedMapEntry
 from robominer_slam.operator.status_entries import StatusEntry
+from robominer_slam.publishing.bus_messages import QueryError
+from robominer_slam.publishing.map_state import MapState
 from robominer_slam.publishing.map_stream import MapStreamDecoder, MapStreamEncoder
 from robominer_slam.publishing.report_messages import Level
 from robominer_slam.replay import prepare, replay
@@ -71,6 +74,18 @@ class RecordingSource:
         """Stop reading."""
         self._stop.set()
         self._thread.join()
+
+    def saved_maps(self) -> list[SavedMapEntry]:
+        """A recording has no disk."""
+        return []
+
+    def saved_map(self, number: int) -> MapState:
+        """There is none.
+
+        Raises:
+            QueryError: always.
+        """
+        raise QueryError(f"map {number}: this is a recording: there are no saved maps")
 
     def command(self, name: str, parameters: Mapping[str, str]) -> CommandResult:  # noqa: ARG002
         """Nobody is there to do anything."""

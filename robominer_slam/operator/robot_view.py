@@ -18,6 +18,7 @@ from robominer_slam.operator.live_frame import LiveFrame, covariance_of
 from robominer_slam.operator.map_model import MapModel
 from robominer_slam.operator.session_history import SessionHistory
 from robominer_slam.operator.status_entries import StatusEntry
+from robominer_slam.operator.status_history import PastStatus, StatusHistory
 from robominer_slam.operator.traffic import Traffic
 from robominer_slam.publishing.map_state import MapState
 from robominer_slam.publishing.telemetry import Health, Telemetry
@@ -53,6 +54,7 @@ class RobotView:
         map_since_ns: stamp of the newest frame when another map began; 0 in the first.
         traffic: messages, bytes, outages.
         history: of the session.
+        status_history: what the robot said of itself in it.
         events: log of what happened, the newest last.
         driven_m: since this console began to listen.
         latency_s: of the newest frame: arrival less its stamp, by both computers' clocks.
@@ -72,6 +74,7 @@ class RobotView:
         self.map_since_ns = 0
         self.traffic = Traffic()
         self.history = history or SessionHistory()
+        self.status_history = StatusHistory()
         self.events: deque[SessionEvent] = deque(maxlen=KEPT_EVENTS)
         self.driven_m = 0.0
         self.latency_s: float | None = None
@@ -136,6 +139,8 @@ class RobotView:
         """What the robot says of itself."""
         with self.lock:
             self.status = entries
+            if self.live is not None:
+                self.status_history.add(PastStatus(self.live.stamp_ns, entries, self.health()))
 
     def take_map(self, state: MapState) -> None:
         """The map's newest state."""

@@ -74,7 +74,7 @@ class PageStream:
             if self._is_due("trail", TRAIL_S):
                 await self._trail()
             if self._is_due("readings", READINGS_S):
-                await self._json("readings", **readings(self._view, self._meter))
+                await self._json("readings", **readings(self._view, self._meter, self.seek_ns))
             await asyncio.sleep(max(0.001, TURN_S - (time.monotonic() - begin)))
 
     def _is_due(self, name: str, interval_s: float) -> bool:

@@ -22,8 +22,10 @@ from robominer_slam.operator import exports
 from robominer_slam.operator.access import AccessGuard, is_loopback
 from robominer_slam.operator.page import build_page
 from robominer_slam.operator.readings import ProcessorMeter
+from robominer_slam.operator.saved_maps import FORMATS
 from robominer_slam.operator.session import Session
 from robominer_slam.operator.stream import PageStream
+from robominer_slam.publishing.bus_messages import QueryError
 
 log = logging.getLogger(__name__)
 
@@ -83,10 +85,18 @@ def application(session: Session, token: str | None) -> FastAPI:
     @app.get("/export/{name}")
     def export(name: str) -> Response:
         if name not in _EXPORTS:
-            return Response(f"expected one of {', '.join(_EXPORTS)}\n", status_code=404, media_type="text/plain")
-        robot = re.sub(r"[^A-Za-z0-9_.-]", "_", session.robot)
-        headers = {"Content-Disposition": f'attachment; filename="{robot}-{name}"'}
-        return Response(_EXPORTS[name](session.view), media_type="application/octet-stream", headers=headers)
+            return _not_found(f"expected one of {', '.join(_EXPORTS)}")
+        return _file(session.robot, name, _EXPORTS[name](session.view))
+
+    @app.get("/saved/{number}.{ending}")
+    def saved(number: int, ending: str) -> Response:
+        if ending not in FORMATS:
+            return _not_found(f"expected an ending of {', '.join(FORMATS)}")
+        try:
+            state = session.saved_map(number)
+        except QueryError as error:
+            return _not_found(str(error))
+        return _file(session.robot, f"map-{number}.{ending}", FORMATS[ending](state))
 
     ui.page("/")(lambda: build_page(session))
     ui.run_with(
@@ -99,6 +109,16 @@ def application(session: Session, token: str | None) -> FastAPI:
     )
     app.add_middleware(AccessGuard, token=token)
     return app
+
+
+def _not_found(why: str) -> Response:
+    return Response(f"{why}\n", status_code=404, media_type="text/plain")
+
+
+def _file(robot: str, name: str, content: bytes) -> Response:
+    robot = re.sub(r"[^A-Za-z0-9_.-]", "_", robot)
+    headers = {"Content-Disposition": f'attachment; filename="{robot}-{name}"'}
+    return Response(content, media_type="application/octet-stream", headers=headers)
 
 
 def listening_socket(host: str, port: int) -> socket.socket:

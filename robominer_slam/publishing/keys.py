@@ -39,6 +39,8 @@ _ENCODINGS = {
     "map/cloud": f"{CDR};{POINT_CLOUD}",
     "map/grid": f"{CDR};{OCCUPANCY_GRID}",
     "map/graph": JSON,
+    "map/closures": JSON,
+    "map/saved": MAP_STREAM,
     "telemetry": TELEMETRY,
 }
 

@@ -70,6 +70,8 @@ class MapReceiver:
         bus: Asking,
         on_change: Callable[[MapState], None] | None = None,
         clock: Callable[[], float] = time.monotonic,
+        source: str = SNAPSHOT,
+        parameters: Mapping[str, str] | None = None,
     ) -> None:
         """Start without a copy.
 
@@ -77,11 +79,14 @@ class MapReceiver:
             bus: to ask on.
             on_change: called with each new state, in the thread that brought it, one after the other.
             clock: monotonic time, s.
+            source: key of the queries.
+            parameters: of every query, beside its own.
         """
         self.counters = Counters()
         self._bus = bus
         self._on_change = on_change
         self._clock = clock
+        self._source, self._parameters = source, dict(parameters or {})
         self._lock = threading.Lock()
         #: Held from taking a message until the owner has the state that came of it, so that none overtakes another.
         self._feeding = threading.Lock()
@@ -166,7 +171,10 @@ class MapReceiver:
             self._asked_s, self._got_bytes = now, 0
             timeout_s = self._timeout_s
             self.counters["queries"] += 1
-        self._bus.ask(SNAPSHOT, wanted, lambda received: self._reply(received), lambda: self._end(number), timeout_s)
+        wanted |= self._parameters
+        self._bus.ask(
+            self._source, wanted, lambda received: self._reply(received), lambda: self._end(number), timeout_s
+        )
 
     def _wanted(self, now: float) -> dict[str, str] | None:
         """Parameters of the query that is due."""

@@ -21,6 +21,9 @@ function drawnInSoftware() {
   return /swiftshader|llvmpipe|software/i.test(name);
 }
 
+/** In place of a renderer where the browser has none: the page's panels and commands go on. */
+const UNDRAWN = { setPixelRatio() {}, getPixelRatio: () => 1, setSize() {}, render() {} };
+
 export default {
   template: `
     <div class="map-view" data-testid="map">
@@ -61,13 +64,14 @@ export default {
       </div>
       <div class="map-compass" title="Axes of the map frame; its north is +y"><svg viewBox="-24 -24 48 48" ref="compass"><circle r="22"/><path d="M0,-17 L7,12 L0,7 L-7,12 Z"/></svg><span>N (map +y)</span></div>
       <div class="map-corner"><div ref="scale" class="map-scale"></div><span ref="count" class="map-count"></span></div>
-      <div class="map-empty" v-show="empty">No map yet: it grows where whiskers touch</div>
+      <div class="map-empty" role="alert" data-testid="no-graphics" v-if="graphicsFault">The map cannot be drawn: this browser offers no WebGL 2 ({{ graphicsFault }}). Switch on hardware acceleration in its settings, or use another browser. Panels and commands work.</div>
+      <div class="map-empty" v-else v-show="empty">No map yet: it grows where whiskers touch</div>
     </div>`,
   props: { dark: Boolean },
   data() {
     return {
       mode: "3d", follow: true, tool: null, waypoints: false, layersOpen: false, layers: LAYERS, palettes: Object.keys(COLOUR_MAPS),
-      palette: "viridis", heights: [0, 1], empty: true, shown: Object.fromEntries(Object.keys(LAYERS).map((name) => [name, true])),
+      palette: "viridis", heights: [0, 1], empty: true, graphicsFault: "", shown: Object.fromEntries(Object.keys(LAYERS).map((name) => [name, true])),
     };
   },
   computed: {
@@ -85,7 +89,12 @@ export default {
     // Kept out of Vue's sight: it must not watch a million points.
     const own = (this.own = Object.create(null));
     const plain = drawnInSoftware();
-    own.renderer = new THREE.WebGLRenderer({ canvas, antialias: !plain, powerPreference: "high-performance" });
+    try {
+      own.renderer = new THREE.WebGLRenderer({ canvas, antialias: !plain, powerPreference: "high-performance" });
+    } catch (error) {
+      this.graphicsFault = error.message;
+      own.renderer = UNDRAWN;
+    }
     own.renderer.setPixelRatio(plain ? 1 : Math.min(window.devicePixelRatio, 2));
     own.scene = new THREE.Scene();
     own.cloud = new PointCloud();
