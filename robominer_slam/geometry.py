@@ -112,7 +112,10 @@ def pose_matrix(xyz: ArrayLike, quaternion: ArrayLike) -> FloatArray:
 def to_vector7(T: ArrayLike) -> FloatArray:
     """x, y, z, qx, qy, qz, qw (..., 7) of pose matrices (..., 4, 4)."""
     m = np.asarray(T, dtype=np.float64)
-    return np.concatenate([m[..., :3, 3], matrix_to_quaternion(m[..., :3, :3])], axis=-1)
+    vector = np.empty((*m.shape[:-2], 7))
+    vector[..., :3] = m[..., :3, 3]
+    vector[..., 3:] = matrix_to_quaternion(m[..., :3, :3])
+    return vector
 
 
 def from_vector7(vector: ArrayLike) -> FloatArray:

@@ -114,6 +114,8 @@ def matrix_to_quaternion(R: ArrayLike) -> FloatArray:
     branches), which is well conditioned at any angle, pi included.
     """
     m = np.asarray(R, dtype=np.float64)
+    if m.ndim == 2:
+        return _one_quaternion(m)
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     K = np.empty((*m.shape[:-2], 4, 4))
     K[..., 0, 0] = 1.0 + xx - yy - zz
@@ -130,6 +132,25 @@ def matrix_to_quaternion(R: ArrayLike) -> FloatArray:
     q = np.take_along_axis(K, longest[..., None, None], axis=-2)[..., 0, :]
     q = q / np.sqrt(squared_norm(q))[..., None]
     return np.where(q[..., 3:] < 0.0, -q, q)
+
+
+def _one_quaternion(m: FloatArray) -> FloatArray:
+    """The same of one matrix, a dozen times quicker: every frame needs three."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = m.tolist()
+    squares = (1.0 + xx - yy - zz, 1.0 - xx + yy - zz, 1.0 - xx - yy + zz, 1.0 + xx + yy + zz)
+    longest = squares.index(max(squares))
+    if longest == 3:
+        x, y, z, w = zy - yz, xz - zx, yx - xy, squares[3]
+    elif longest == 0:
+        x, y, z, w = squares[0], yx + xy, zx + xz, zy - yz
+    elif longest == 1:
+        x, y, z, w = yx + xy, squares[1], zy + yz, xz - zx
+    else:
+        x, y, z, w = zx + xz, zy + yz, squares[2], yx - xy
+    length = math.sqrt(x * x + y * y + z * z + w * w)
+    if w < 0.0:
+        length = -length
+    return np.array((x / length, y / length, z / length, w / length))
 
 
 def quaternion_log(quaternion: ArrayLike) -> FloatArray:

@@ -62,6 +62,7 @@ class TestRotations:
         np.testing.assert_allclose(R, Rotation.from_quat(q).as_matrix(), atol=1e-13)
         back = g.matrix_to_quaternion(R)
         assert back[3] >= 0.0
+        np.testing.assert_allclose(back, g.matrix_to_quaternion(R[None])[0], atol=1e-14)
         unit = q / np.linalg.norm(q)
         assert min(np.abs(back - unit).max(), np.abs(back + unit).max()) < 1e-13
 

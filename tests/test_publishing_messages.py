@@ -222,6 +222,36 @@ def test_diagnostics_keep_levels_names_and_values() -> None:
         assert values == content[0].values
 
 
+@settings(max_examples=50)
+@given(
+    st.lists(
+        st.builds(
+            Diagnostic,
+            st.text(max_size=9),
+            st.sampled_from(Level),
+            st.text(max_size=9),
+            st.dictionaries(st.text(max_size=9), st.text(max_size=9), max_size=3),
+            st.text(max_size=5),
+        ),
+        max_size=4,
+    )
+)
+def test_packed_diagnostics_equal_the_serialised_ones(content: list[Diagnostic]) -> None:
+    status = [
+        new(
+            "diagnostic_msgs/msg/DiagnosticStatus",
+            level=int(entry.level),
+            name=entry.name,
+            message=entry.message,
+            hardware_id=entry.hardware_id,
+            values=[new("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in entry.values.items()],
+        )
+        for entry in content
+    ]
+    message = new(report_messages.DIAGNOSTIC_ARRAY, header=header(STAMP, ""), status=status)
+    assert report_messages.diagnostics(STAMP, content) == serialize(message, report_messages.DIAGNOSTIC_ARRAY)
+
+
 def test_poses_and_transforms_are_read_by_an_independent_decoder() -> None:
     rng = np.random.default_rng(7)
     pose, covariance = quaternion_pose(rng), rng.normal(size=(6, 6))
