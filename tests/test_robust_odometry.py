@@ -20,8 +20,7 @@ from robominer_slam.estimation.planar_motion import (
     Inputs,
     compose,
     compose_jacobian,
-    motion,
-    motion_jacobian,
+    step,
 )
 from robominer_slam.estimation.robust_odometry import RobustOdometry
 from robominer_slam.estimation.screw_kinematics import forward_matrix
@@ -40,10 +39,11 @@ def numeric(f, x, step=1e-6):
 def test_motion_jacobian_equals_finite_differences(state, dt, has_gyro, has_screws):
     level = np.array([[0.98, 0.05], [-0.02, 0.99]])
     inputs = Inputs(dt, 0.7 if has_gyro else None, np.array([0.2, -0.1]) if has_screws else None, level)
-    F, by_velocity = motion_jacobian(state, inputs)
-    np.testing.assert_allclose(F, numeric(lambda x: motion(x, inputs), state), atol=1e-7)
+    moved = step(state, inputs)
+    np.testing.assert_allclose(moved.by_state, numeric(lambda x: step(x, inputs).state[:6], state), atol=1e-7)
+    np.testing.assert_array_equal(moved.state[6:], state[6:])
     if not has_gyro and not has_screws:
-        np.testing.assert_allclose(by_velocity, F[REL, 3:6], atol=1e-12)
+        np.testing.assert_allclose(moved.by_velocity, moved.by_state[:, 3:6], atol=1e-12)
 
 
 @given(states)

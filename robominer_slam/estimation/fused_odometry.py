@@ -9,17 +9,18 @@ The body is taken as level.
 from __future__ import annotations
 
 import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
 
 from drivers.measurement import ImuSample, Measurement, ScrewAngles, ScrewSpeeds
 from robominer_slam.configuration.model import EstimationSection
+from robominer_slam.estimation.kalman_filter import KalmanFilter
 from robominer_slam.estimation.odometry_state import OdometryState
 from robominer_slam.estimation.screw_speeds import ScrewAngleSpeeds, ScrewSpeedAssembly
 
 FloatArray = NDArray[np.float64]
 
 X, Y, YAW, VX, VY, WZ, BIAS = range(7)
+VELOCITY = slice(VX, BIAS)
 STATE = 7
 #: Deviation of the velocity, m/s and rad/s, of a robot whose screws stand still: it may creep.
 STILL_SIGMA = 0.002
@@ -54,25 +55,6 @@ def motion_jacobian(state: FloatArray, dt: float) -> FloatArray:
     return F
 
 
-def gyro_measurement(state: FloatArray) -> FloatArray:
-    """What the gyro's vertical axis reads, shape (1,), rad/s."""
-    return H_GYRO @ state
-
-
-def velocity_measurement(state: FloatArray) -> FloatArray:
-    """The body velocity, shape (3,)."""
-    return state[VX : WZ + 1]
-
-
-class _PlanarFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has no types
-    """filterpy's filter with our motion as its prediction."""
-
-    dt = 0.0
-
-    def predict_x(self, _u: float = 0.0) -> None:
-        self.x: FloatArray = motion(self.x, self.dt)
-
-
 class FusedOdometry:
     """Fuses IMU (gyro) and screws; measurements come in the order of their stamps.
 
@@ -84,9 +66,8 @@ class FusedOdometry:
     def __init__(self, noise: EstimationSection, screw_matrix: FloatArray) -> None:
         self._noise = noise
         self._screw_matrix = screw_matrix
-        self._filter = _PlanarFilter(dim_x=STATE, dim_z=3)
-        self._filter.x = np.zeros(STATE)
-        self._filter.P = np.diag([0.0, 0.0, 0.0, 1e-4, 1e-4, 1e-4, noise.sigma_gyro_bias_start**2])
+        variance = [0.0, 0.0, 0.0, 1e-4, 1e-4, 1e-4, noise.sigma_gyro_bias_start**2]
+        self._filter = KalmanFilter(np.zeros(STATE), np.diag(variance))
         self._stamp_ns: int | None = None
         self._angles = ScrewAngleSpeeds()
         self._speeds = ScrewSpeedAssembly()
@@ -100,7 +81,7 @@ class FusedOdometry:
         match measurement:
             case ImuSample(gyro=gyro) if gyro is not None:
                 self._predict(measurement.stamp_ns)
-                self._filter.update(gyro[2:3], lambda _: H_GYRO, gyro_measurement, self._R_gyro)
+                self._filter.correct(gyro[2:3] - H_GYRO @ self._filter.x, H_GYRO, self._R_gyro)
             case ScrewAngles():
                 speed = self._angles.add(measurement)
                 if speed is not None:
@@ -129,9 +110,9 @@ class FusedOdometry:
             float(x[X]),
             float(x[Y]),
             float(x[YAW]),
-            x[VX : WZ + 1].copy(),
+            x[VELOCITY].copy(),
             P[:VX, :VX].copy(),
-            P[VX : WZ + 1, VX : WZ + 1].copy(),
+            P[VELOCITY, VELOCITY].copy(),
         )
 
     @property
@@ -146,12 +127,12 @@ class FusedOdometry:
 
     def _update_screws(self, speed: FloatArray) -> None:
         if np.abs(speed).max() < self._noise.still_screw_speed:
-            self._filter.update(np.zeros(3), lambda _: H_VELOCITY, velocity_measurement, self._R_still)
+            self._filter.correct(-self._filter.x[VELOCITY], H_VELOCITY, self._R_still)
         else:
             velocity = (self._screw_matrix @ speed)[:3]
             # Slip takes a share of what the screws do: fast motion is known less well than slow motion.
             R = self._R_screws + np.diag(np.square(self._slip * velocity))
-            self._filter.update(velocity, lambda _: H_VELOCITY, velocity_measurement, R)
+            self._filter.correct(velocity - self._filter.x[VELOCITY], H_VELOCITY, R)
 
     def _predict(self, stamp_ns: int) -> None:
         previous = self._stamp_ns
@@ -160,11 +141,11 @@ class FusedOdometry:
             return
         self._stamp_ns = stamp_ns
         ekf, noise = self._filter, self._noise
-        ekf.dt = (stamp_ns - previous) * 1e-9
-        ekf.F = motion_jacobian(ekf.x, ekf.dt)
-        driven = float(np.hypot(ekf.x[VX], ekf.x[VY])) * ekf.dt
+        dt = (stamp_ns - previous) * 1e-9
+        F = motion_jacobian(ekf.x, dt)
+        driven = float(np.hypot(ekf.x[VX], ekf.x[VY])) * dt
         slip = noise.position_walk**2 * driven
-        walk = noise.acceleration_walk**2 * ekf.dt
-        turn = noise.angular_acceleration_walk**2 * ekf.dt
-        ekf.Q = np.diag([slip, slip, 0.0, walk, walk, turn, noise.gyro_bias_walk**2 * ekf.dt])
-        ekf.predict()
+        walk = noise.acceleration_walk**2 * dt
+        turn = noise.angular_acceleration_walk**2 * dt
+        ekf.x = motion(ekf.x, dt)
+        ekf.P = F @ ekf.P @ F.T + np.diag([slip, slip, 0.0, walk, walk, turn, noise.gyro_bias_walk**2 * dt])

@@ -13,10 +13,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import cache
 
 import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
@@ -47,80 +45,67 @@ class Inputs:
     level: FloatArray = field(default_factory=lambda: LEVEL)
 
 
-def velocity(state: FloatArray, inputs: Inputs) -> tuple[float, float, float]:
-    """Body velocity vx, vy, wz in the interval."""
-    # Plain floats: numpy takes longer to hand out a number than it takes to compute with it.
+@dataclass(frozen=True, slots=True)
+class Step:
+    """An interval's motion: the state after it, and derivatives of what moves, X to WZ (the other states stay).
+
+    Attributes:
+        state: after the interval, shape (n,).
+        by_state: derivative of the moving states by the state before, shape (6, n).
+        by_velocity: derivative of the moving states by the velocity in the interval, shape (6, 3).
+    """
+
+    state: FloatArray
+    by_state: FloatArray
+    by_velocity: FloatArray
+
+
+def step(state: FloatArray, inputs: Inputs) -> Step:
+    """Move for an interval at constant body velocity; midpoint in the heading.
+
+    In plain floats: numpy takes longer to hand out a number than it takes to compute with it.
+    """
     values = state.tolist()
+    n = len(values)
     vx, vy, wz = values[VELOCITY]
+    # Derivatives of the velocity by the state: column, and what each row has there.
+    by_vx, by_vy, by_wz = [(VX, 1.0)], [(VY, 1.0)], [(WZ, 1.0)]
     if inputs.screws is not None:
-        vx, vy = inputs.screws.tolist()
+        screw_x, screw_y = inputs.screws.tolist()
         mean, varying = SLIP_MEAN.start, SLIP.start
-        vx *= 1.0 - values[mean] - values[varying]
-        vy *= 1.0 - values[mean + 1] - values[varying + 1]
+        vx = screw_x * (1.0 - values[mean] - values[varying])
+        vy = screw_y * (1.0 - values[mean + 1] - values[varying + 1])
+        by_vx = [(mean, -screw_x), (varying, -screw_x)]
+        by_vy = [(mean + 1, -screw_y), (varying + 1, -screw_y)]
     if inputs.gyro is not None:
         wz = inputs.gyro - values[GYRO_BIAS]
-    return vx, vy, wz
-
-
-def velocity_jacobian(state: FloatArray, inputs: Inputs) -> FloatArray:
-    """Derivative of `velocity` by the state, shape (3, n)."""
-    V = np.zeros((3, len(state)))
-    if inputs.screws is None:
-        V[0, VX] = V[1, VY] = 1.0
-    else:
-        V[0, SLIP_MEAN.start] = V[0, SLIP.start] = -inputs.screws[0]
-        V[1, SLIP_MEAN.start + 1] = V[1, SLIP.start + 1] = -inputs.screws[1]
-    if inputs.gyro is None:
-        V[2, WZ] = 1.0
-    else:
-        V[2, GYRO_BIAS] = -1.0
-    return V
-
-
-def motion(state: FloatArray, inputs: Inputs) -> FloatArray:
-    """The state after an interval at constant body velocity; midpoint in the heading."""
-    later = state.copy()
-    vx, vy, wz = velocity(state, inputs)
-    later[VELOCITY] = vx, vy, wz
+        by_wz = [(GYRO_BIAS, -1.0)]
     dt = inputs.dt
-    turn = wz * dt
-    middle = float(state[YAW]) + 0.5 * turn
+    middle = values[YAW] + 0.5 * wz * dt
     c, s = math.cos(middle) * dt, math.sin(middle) * dt
     (a, b), (d, e) = inputs.level.tolist()
     ahead, left = a * vx + b * vy, d * vx + e * vy
-    later[X] += c * ahead - s * left
-    later[Y] += s * ahead + c * left
-    later[YAW] += turn
-    return later
-
-
-def motion_jacobian(state: FloatArray, inputs: Inputs) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of `motion` by the state, (n, n), and of the pose (x, y, yaw) by the velocity, (3, 3)."""
-    vx, vy, wz = velocity(state, inputs)
-    dt = inputs.dt
-    heading = float(state[YAW]) + 0.5 * wz * dt
-    c, s = math.cos(heading) * dt, math.sin(heading) * dt
-    (a, b), (d, e) = inputs.level.tolist()
-    ahead, left = a * vx + b * vy, d * vx + e * vy
-    dx, dy = -s * ahead - c * left, c * ahead - s * left
-    D = np.array(
-        [
-            [c * a - s * d, c * b - s * e, 0.5 * dt * dx],
-            [s * a + c * d, s * b + c * e, 0.5 * dt * dy],
-            [0.0, 0.0, dt],
-        ]
+    dx, dy = c * ahead - s * left, s * ahead + c * left
+    values[X] += dx
+    values[Y] += dy
+    values[YAW] += wz * dt
+    values[VELOCITY] = vx, vy, wz
+    D = (
+        (c * a - s * d, c * b - s * e, -0.5 * dt * dy),
+        (s * a + c * d, s * b + c * e, 0.5 * dt * dx),
+        (0.0, 0.0, dt),
     )
-    V = velocity_jacobian(state, inputs)
-    F = _identity(len(state)).copy()
-    F[VELOCITY] = V
-    F[REL] += D.dot(V)
-    F[X, YAW], F[Y, YAW] = dx, dy
-    return F, D
-
-
-@cache
-def _identity(n: int) -> FloatArray:
-    return np.eye(n)
+    rows = [[0.0] * n for _ in range(6)]
+    for k in (X, Y, YAW):
+        rows[k][k] = 1.0
+    rows[X][YAW], rows[Y][YAW] = -dy, dx
+    for axis, by in enumerate((by_vx, by_vy, by_wz)):
+        for column, slope in by:
+            rows[VX + axis][column] = slope
+            for k in (X, Y, YAW):
+                rows[k][column] += D[k][axis] * slope
+    by_velocity = np.array((*D, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+    return Step(np.array(values), np.array(rows), by_velocity)
 
 
 def compose(state: FloatArray) -> FloatArray:
@@ -177,103 +162,3 @@ def motion_ahead(state: FloatArray, ahead: FloatArray, screws: FloatArray | None
     held[2, SLIP_MEAN.start : SLIP_MEAN.start + 2] = by_slip
     held[3, SLIP.start : SLIP.start + 2] = by_slip
     return held
-
-
-class PlanarFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has no types
-    """filterpy's filter with our motion, and a gate that never shuts.
-
-    A measurement whose squared Mahalanobis distance d2 exceeds the gate counts with its covariance grown by
-    d2 / gate: an outlier's pull is bounded, and a filter that has gone wrong is still pulled back.
-
-    Attributes:
-        outliers: measurements beyond the gate.
-    """
-
-    def __init__(self, x: FloatArray, P: FloatArray, gate: float) -> None:
-        """Start at state x with covariance P."""
-        super().__init__(dim_x=len(x), dim_z=3)
-        self.x: FloatArray = x
-        self.P: FloatArray = P
-        self.gate = gate
-        self.outliers = 0
-        self._inputs = Inputs(0.0)
-        self._fading = 1.0
-        self._effect = np.vstack([np.zeros((3, 3)), np.eye(3)])
-
-    def predict_x(self, _u: float = 0.0) -> None:
-        """Move the state."""
-        self.x = motion(self.x, self._inputs)
-        if self._fading < 1.0:
-            self.x[SLIP] *= self._fading
-
-    def move(self, inputs: Inputs, Q_velocity: FloatArray, q: FloatArray, fading: float = 1.0) -> None:
-        """Predict to the end of an interval.
-
-        Args:
-            inputs: what moves the state.
-            Q_velocity: covariance of the velocity in the interval, shape (3, 3).
-            q: variances that the interval adds to the states, shape (n,).
-            fading: factor by which the varying slip fades.
-        """
-        self._inputs, self._fading = inputs, fading
-        F, D = motion_jacobian(self.x, inputs)
-        n = len(q)
-        Q = np.zeros((n, n))
-        Q.reshape(-1)[:: n + 1] = q
-        # What the velocity's noise does to the pose and to the velocity itself; `dot` takes half of what `@` does.
-        effect = self._effect
-        effect[REL] = D
-        Q[:KEY_X, :KEY_X] += effect.dot(Q_velocity).dot(effect.T)
-        if fading < 1.0:
-            F[SLIP, SLIP] *= fading
-        self.F, self.Q = F, Q
-        self.predict()
-
-    def correct(self, innovation: FloatArray, H: FloatArray, R: FloatArray, held: FloatArray | None = None) -> float:
-        """Update with a measurement that differs from its prediction by `innovation`, shape (m,).
-
-        Args:
-            innovation: measured less predicted.
-            H: derivative of the prediction by the state, shape (m, n).
-            R: covariance of the measurement, shape (m, m).
-            held: orthonormal rows, shape (k, n): combinations of states that this measurement must not move.
-
-        Returns:
-            The squared Mahalanobis distance.
-        """
-        PHT = self.P @ H.T
-        S = H @ PHT + R
-        if len(innovation) == 1:
-            distance = float(innovation[0] ** 2 / S[0, 0])
-        else:
-            distance = float(innovation @ np.linalg.solve(S, innovation))
-        if distance > self.gate:
-            self.outliers += 1
-            R = R * (distance / self.gate)
-        if held is None:
-            self.update(innovation, lambda _: H, lambda _: np.zeros(len(innovation)), R)
-            return distance
-        # Any gain is allowed as long as the covariance follows it (Joseph's form); this one leaves `held` alone.
-        gain = np.linalg.solve(H @ PHT + R, PHT.T).T
-        gain -= held.T @ (held @ gain)
-        left = np.eye(len(self.x)) - gain @ H
-        self.x = self.x + gain @ innovation
-        self.P = left @ self.P @ left.T + gain @ R @ gain.T
-        return distance
-
-    def begin_window(self) -> None:
-        """Keep the present heading in odom as the window's."""
-        T = np.eye(len(self.x))
-        T[WINDOW_YAW] = 0.0
-        T[WINDOW_YAW, [YAW, KEY_YAW]] = 1.0
-        self.x = T @ self.x
-        self.P = T @ self.P @ T.T
-
-    def keyframe(self) -> None:
-        """Make the present pose the keyframe's: the pose since becomes zero and is known."""
-        T = np.eye(len(self.x))
-        T[KEY] = compose_jacobian(self.x)
-        T[REL] = 0.0
-        self.x[KEY] = compose(self.x)
-        self.x[REL] = 0.0
-        self.P = T @ self.P @ T.T

@@ -24,13 +24,13 @@ from robominer_slam.estimation.drag_direction import DragDirection
 from robominer_slam.estimation.imu_batch import ImuBatch
 from robominer_slam.estimation.keyframe_motion import KeyframeMotion
 from robominer_slam.estimation.odometry_state import OdometryState
+from robominer_slam.estimation.planar_filter import PlanarFilter
 from robominer_slam.estimation.planar_motion import (
     GYRO_BIAS,
     REL,
     SLIP,
     VELOCITY,
     Inputs,
-    PlanarFilter,
     X,
     Y,
     compose,
