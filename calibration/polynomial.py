@@ -129,15 +129,15 @@ class PolynomialEvaluator:
     def __init__(self, model: PolynomialModel) -> None:
         """Lay out the model's coefficients."""
         n = len(model.rest_mT)
-        self._degree = model.degree
         self._polarity = np.where(model.rest_mT[:, 2] < 0.0, -1.0, 1.0)
         strength = np.maximum(np.sqrt(np.square(model.rest_mT).sum(axis=-1)), 1.0)
         self._inverse_strength = 1.0 / strength
         self._coefficients = np.ascontiguousarray(model.coefficients.transpose(2, 1, 0))
-        # The monomials of a degree are those of the degree below times x, those of them without x times y, and the
-        # last one times z: products of slices, as numpy's calls cost more than its products.
-        self._features = np.ones((model.coefficients.shape[1], n))
-        self._products = _products(self._features, model.degree)
+        # Every monomial is the product of two of at most half the degree (rounded up), which are few: rows of a table.
+        # A product of many rows at once costs less than numpy's calls for one degree after the other.
+        self._half = _rows(model.degree)
+        self._first, self._second = _factors(model.degree)
+        self._table = np.ones((len(_exponents((model.degree + 1) // 2)), n))
 
     def tilt(self, field_mT: FloatArray) -> FloatArray:
         """Tilt vectors, shape (2, n), rad, of one field reading per whisker, shape (n, 3), mT."""
@@ -149,22 +149,39 @@ class PolynomialEvaluator:
         transverse = np.sqrt(np.maximum(transverse_square, 1e-18))
         u[:2] *= np.arctan2(2.0 * transverse, u[2]) / transverse
         u[2] = strength * self._inverse_strength - 1.0
-        for of, variable, product in self._products:
-            np.multiply(of, u[variable], out=product)
-        tilt: FloatArray = np.einsum("otn,tn->on", self._coefficients, self._features)
+        table = self._table
+        table[1:4] = u
+        at = 4
+        for parents, variables in self._half:
+            table[at : at + len(parents)] = table.take(parents, axis=0) * table.take(variables, axis=0)
+            at += len(parents)
+        features = table.take(self._first, axis=0)
+        features *= table.take(self._second, axis=0)
+        tilt: FloatArray = np.einsum("otn,tn->on", self._coefficients, features)
         return tilt
 
 
-def _products(features: FloatArray, degree: int) -> list[tuple[FloatArray, int, FloatArray]]:
-    """Views of all monomials, shape (terms, n), in the order of `monomials`: factor, variable, where it goes."""
-    products = []
-    begin, size = 0, 1
-    for d in range(1, degree + 1):
-        end = begin + size
-        at = end
-        # Of degree d - 1, this many do not have x, nor x and y.
-        for variable, count in enumerate((size, d, 1)):
-            products.append((features[end - count : end], variable, features[at : at + count]))
-            at += count
-        begin, size = end, at - end
-    return products
+def _exponents(degree: int) -> list[tuple[int, ...]]:
+    """Monomials up to a degree as sorted variables, in the order of `monomials`: (), (0,), (1,), (2,), (0, 0), ..."""
+    return [one for size in range(degree + 1) for one in combinations_with_replacement(range(3), size)]
+
+
+def _rows(degree: int) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+    """How each degree from 2 to half of `degree` follows: rows of the table to be multiplied."""
+    known = _exponents((degree + 1) // 2)
+    place = {monomial: k for k, monomial in enumerate(known)}
+    steps = []
+    for size in range(2, (degree + 1) // 2 + 1):
+        made = [monomial for monomial in known if len(monomial) == size]
+        parents = np.array([place[monomial[:-1]] for monomial in made], dtype=np.intp)
+        steps.append((parents, np.array([place[monomial[-1:]] for monomial in made], dtype=np.intp)))
+    return steps
+
+
+def _factors(degree: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Two rows of the table for each monomial up to `degree`, whose product it is."""
+    half = (degree + 1) // 2
+    place = {monomial: k for k, monomial in enumerate(_exponents(half))}
+    wanted = _exponents(degree)
+    first = np.array([place[monomial[:half]] for monomial in wanted], dtype=np.intp)
+    return first, np.array([place[monomial[half:]] for monomial in wanted], dtype=np.intp)

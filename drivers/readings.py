@@ -5,6 +5,7 @@ The clock (`clock.py`) and the device (`device.py`) turn readings into measureme
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
@@ -138,4 +139,10 @@ def count_not_finite(reading: Reading) -> int:
             parts = [reading.speed, reading.current_mA, reading.voltage_V]
         case _:
             return 0
-    return sum(int(np.count_nonzero(~np.isfinite(part))) for part in parts if part is not None)
+    # As floats: numpy takes longer to begin with three numbers than to look at them one by one.
+    return sum(not math.isfinite(value) for part in parts if part is not None for value in _values(part))
+
+
+def _values(part: FloatArray | float) -> list[float]:
+    """The numbers of an array, or the one that there is."""
+    return [part] if isinstance(part, float) else part.tolist()

@@ -77,6 +77,6 @@ def test_a_prediction_is_filterpys(fading: float) -> None:
     theirs.P, theirs.F, theirs.Q = P.copy(), F, np.diag(q) + effect @ Q_velocity @ effect.T
     theirs.predict()
     ours = PlanarFilter(x.copy(), P.copy(), 9.0)
-    ours.move(inputs, Q_velocity, q, fading)
+    ours.move(inputs, Q_velocity, q.tolist(), fading)
     np.testing.assert_allclose(ours.P, theirs.P, atol=1e-12)
     np.testing.assert_allclose(ours.x[SLIP], fading * x[SLIP], atol=1e-15)

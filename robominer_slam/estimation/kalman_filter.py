@@ -44,6 +44,8 @@ class KalmanFilter:
         Returns:
             The squared Mahalanobis distance.
         """
+        if len(innovation) == 1 and held is None:
+            return self._correct_one(float(innovation[0]), H[0], float(R[0, 0]))
         # Of few numbers, `dot` takes half of what `@` does, and a division a quarter of what `solve` does.
         PHT = self.P.dot(H.T)
         S = H.dot(PHT) + R
@@ -64,4 +66,18 @@ class KalmanFilter:
         later = self.P - 2.0 * gain.dot(PHT.T) + gain.dot(S).dot(gain.T)
         # Multiplied out, it makes what is lopsided by rounding more so with every update.
         self.P = 0.5 * (later + later.T)
+        return distance
+
+    def _correct_one(self, innovation: float, h: FloatArray, variance: float) -> float:
+        """The same with one number, at the best gain: P - P h h' P / s."""
+        Ph = self.P.dot(h)
+        predicted = float(h.dot(Ph))
+        s = predicted + variance
+        distance = innovation**2 / s
+        if distance > self.gate:
+            self.outliers += 1
+            s = predicted + variance * (distance / self.gate)
+        self.x = self.x + Ph * (innovation / s)
+        column = Ph[:, None]
+        self.P = self.P - column.dot(column.T / s)
         return distance

@@ -19,6 +19,7 @@ from robominer_slam.estimation.planar_motion import (
     compose_jacobian,
     step,
 )
+from robominer_slam.float_array import of_floats
 
 FloatArray = NDArray[np.float64]
 
@@ -26,13 +27,13 @@ FloatArray = NDArray[np.float64]
 class PlanarFilter(KalmanFilter):
     """State of `planar_motion`."""
 
-    def move(self, inputs: Inputs, Q_velocity: FloatArray, q: FloatArray, fading: float = 1.0) -> None:
+    def move(self, inputs: Inputs, Q_velocity: FloatArray, q: list[float], fading: float = 1.0) -> None:
         """Predict to the end of an interval.
 
         Args:
             inputs: what moves the state.
             Q_velocity: covariance of the velocity in the interval, shape (3, 3).
-            q: variances that the interval adds to the states, shape (n,).
+            q: variances that the interval adds to the states, n of them.
             fading: factor by which the varying slip fades.
         """
         moved = step(self.x, inputs)
@@ -46,10 +47,12 @@ class PlanarFilter(KalmanFilter):
         later[KEY_X:, :KEY_X] = rows[:, KEY_X:].T
         later[:KEY_X, :KEY_X] = corner
         if fading < 1.0:
-            x[SLIP] *= fading
-            later[SLIP] *= fading
-            later[:, SLIP] *= fading
-        later.reshape(-1)[:: len(q) + 1] += q
+            fade = np.ones(len(x))
+            fade[SLIP] = fading
+            x *= fade
+            later *= fade
+            later *= fade[:, None]
+        later.reshape(-1)[:: len(q) + 1] += of_floats(q)
         self.x, self.P = x, later
 
     def begin_window(self) -> None:

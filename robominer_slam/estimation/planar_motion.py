@@ -17,6 +17,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from robominer_slam.float_array import of_floats
+
 FloatArray = NDArray[np.float64]
 
 X, Y, YAW, VX, VY, WZ, KEY_X, KEY_Y, KEY_YAW, SLOW = range(10)
@@ -69,17 +71,20 @@ def step(state: FloatArray, inputs: Inputs) -> Step:
     n = len(values)
     vx, vy, wz = values[VELOCITY]
     # Derivatives of the velocity by the state: column, and what each row has there.
-    by_vx, by_vy, by_wz = [(VX, 1.0)], [(VY, 1.0)], [(WZ, 1.0)]
+    by_vx: tuple[int, ...] = (VX,)
+    by_vy: tuple[int, ...] = (VY,)
+    by_wz = WZ
+    slope_x = slope_y = slope_wz = 1.0
     if inputs.screws is not None:
         screw_x, screw_y = inputs.screws.tolist()
         mean, varying = SLIP_MEAN.start, SLIP.start
         vx = screw_x * (1.0 - values[mean] - values[varying])
         vy = screw_y * (1.0 - values[mean + 1] - values[varying + 1])
-        by_vx = [(mean, -screw_x), (varying, -screw_x)]
-        by_vy = [(mean + 1, -screw_y), (varying + 1, -screw_y)]
+        by_vx, by_vy = (mean, varying), (mean + 1, varying + 1)
+        slope_x, slope_y = -screw_x, -screw_y
     if inputs.gyro is not None:
         wz = inputs.gyro - values[GYRO_BIAS]
-        by_wz = [(GYRO_BIAS, -1.0)]
+        by_wz, slope_wz = GYRO_BIAS, -1.0
     dt = inputs.dt
     middle = values[YAW] + 0.5 * wz * dt
     c, s = math.cos(middle) * dt, math.sin(middle) * dt
@@ -90,22 +95,27 @@ def step(state: FloatArray, inputs: Inputs) -> Step:
     values[Y] += dy
     values[YAW] += wz * dt
     values[VELOCITY] = vx, vy, wz
-    D = (
-        (c * a - s * d, c * b - s * e, -0.5 * dt * dy),
-        (s * a + c * d, s * b + c * e, 0.5 * dt * dx),
-        (0.0, 0.0, dt),
-    )
-    rows = [[0.0] * n for _ in range(6)]
-    for k in (X, Y, YAW):
-        rows[k][k] = 1.0
-    rows[X][YAW], rows[Y][YAW] = -dy, dx
-    for axis, by in enumerate((by_vx, by_vy, by_wz)):
-        for column, slope in by:
-            rows[VX + axis][column] = slope
-            for k in (X, Y, YAW):
-                rows[k][column] += D[k][axis] * slope
-    by_velocity = np.array((*D, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
-    return Step(np.array(values), np.array(rows), by_velocity)
+    xx, xy = c * a - s * d, c * b - s * e
+    yx, yy = s * a + c * d, s * b + c * e
+    xw, yw = -0.5 * dt * dy, 0.5 * dt * dx
+    # The six rows one after the other: row k begins at k n.
+    F = [0.0] * (6 * n)
+    F[X] = F[n + Y] = F[2 * n + YAW] = 1.0
+    F[YAW], F[n + YAW] = -dy, dx
+    for column in by_vx:
+        F[column] += xx * slope_x
+        F[n + column] += yx * slope_x
+        F[VX * n + column] = slope_x
+    for column in by_vy:
+        F[column] += xy * slope_y
+        F[n + column] += yy * slope_y
+        F[VY * n + column] = slope_y
+    F[by_wz] += xw * slope_wz
+    F[n + by_wz] += yw * slope_wz
+    F[2 * n + by_wz] += dt * slope_wz
+    F[WZ * n + by_wz] = slope_wz
+    by_velocity = [xx, xy, xw, yx, yy, yw, 0.0, 0.0, dt, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+    return Step(of_floats(values), of_floats(F).reshape(6, n), of_floats(by_velocity).reshape(6, 3))
 
 
 def compose(state: FloatArray) -> FloatArray:

@@ -43,6 +43,7 @@ from robominer_slam.estimation.scan_match import match_measurement, relative_cov
 from robominer_slam.estimation.screw_speeds import MAX_INTERVAL_S, ScrewAngleSpeeds, ScrewSpeedAssembly
 from robominer_slam.estimation.spatial_pose import SpatialPose
 from robominer_slam.estimation.turn_comparison import TurnComparison
+from robominer_slam.float_array import of_floats
 
 FloatArray = NDArray[np.float64]
 Source = Literal["fused", "odometry"]
@@ -75,11 +76,12 @@ class RobustOdometry:
         fused = source == "fused"
         x, variance = planar_start.fused(settings) if fused else planar_start.odometry(settings)
         self._match = slice(len(x) - MATCH_STATES, len(x))
-        self._match_variance = variance[self._match].copy()
+        self._match_variance: list[float] = variance[self._match].tolist()
         self._bias = slice(GYRO_BIAS, GYRO_BIAS + 1) if fused else ODOMETRY_BIAS
         self._filter = PlanarFilter(x, np.diag(variance), settings.gate)
         self._H_odometry = planar_start.odometry_rows()
         self._R_screws = (screw_matrix[:3] @ screw_matrix[:3].T) * settings.sigma_screw_speed**2
+        self._R_linear: list[float] = self._R_screws[:2, :2].ravel().tolist()
         self._speeds = ScrewSpeedAssembly()
         self._imu = ImuBatch()
         self._space = SpatialPose(settings, tilts=fused)
@@ -91,8 +93,9 @@ class RobustOdometry:
         self._angles = ScrewAngleSpeeds()
         self._odometry_ns: int | None = None
         self._screws_ns: int | None = None
-        self._input, self._Q_input = np.zeros(2), np.zeros((2, 2))
-        self._Q_still = settings.sigma_still**2 * np.eye(2)
+        self._input = np.zeros(2)
+        #: Covariance of the screws' vx, vy, row by row.
+        self._Q_input = [0.0] * 4
         self._state: OdometryState | None = None
         self._stale = 0
 
@@ -241,10 +244,12 @@ class RobustOdometry:
         still = max(map(abs, speed.tolist())) < settings.still_screw_speed
         self._input = screws[:2]
         if still:
-            self._Q_input = self._Q_still
+            creep = settings.sigma_still**2
+            self._Q_input = [creep, 0.0, 0.0, creep]
         else:
-            self._Q_input = self._R_screws[:2, :2] * self._distrust
-            self._Q_input.flat[::3] += (settings.slip_mode_weight * slip) ** 2
+            mode, distrust = (settings.slip_mode_weight * slip) ** 2, self._distrust
+            xx, xy, yx, yy = self._R_linear
+            self._Q_input = [xx * distrust + mode, xy * distrust, yx * distrust, yy * distrust + mode]
         self._predict(stamp_ns)
         if before is None:
             return
@@ -265,45 +270,49 @@ class RobustOdometry:
         settings, ekf = self._settings, self._filter
         dt = (stamp_ns - previous) * 1e-9
         x = ekf.x
-        q = np.zeros(len(x))
+        q = [0.0] * len(x)
         vx, vy, wz = x[VELOCITY].tolist()
         way = math.hypot(vx, vy) * dt
         q[X] = q[Y] = settings.position_walk**2 * way
-        q[self._match] = self._match_variance * (2.0 * way / settings.match_length)
+        again = 2.0 * way / settings.match_length
+        q[self._match] = [variance * again for variance in self._match_variance]
         walk = settings.acceleration_walk**2 * dt
-        Q_velocity = np.zeros((3, 3))
-        Q_velocity[0, 0] = Q_velocity[1, 1] = walk
-        Q_velocity[2, 2] = settings.angular_acceleration_walk**2 * dt
+        turn_walk = settings.angular_acceleration_walk**2 * dt
+        Q_linear = [walk, 0.0, 0.0, walk]
         gyro = screws = None
         kept = 1.0
         if self._source == "fused":
-            gyro = self._turn(previous, stamp_ns, dt, Q_velocity)
+            gyro, turn_walk = self._turn(previous, stamp_ns, dt, turn_walk)
             if self._screws_ns is not None and stamp_ns - self._screws_ns < MAX_INTERVAL_S * 1e9:
                 screws = self._input
-                Q_velocity[:2, :2] = self._Q_input
+                Q_linear = self._Q_input
             q[GYRO_BIAS] = settings.gyro_bias_walk**2 * dt
             turned = way + abs(wz) * dt * settings.slip_turn_arm
             kept = math.exp(-turned / settings.slip_length)
-            q[SLIP] = settings.sigma_slip**2 * (1.0 - kept * kept)
+            q[SLIP] = [settings.sigma_slip**2 * (1.0 - kept * kept)] * 3
         else:
-            q[ODOMETRY_BIAS] = settings.odometry_bias_walk**2 * dt
+            q[ODOMETRY_BIAS] = [settings.odometry_bias_walk**2 * dt] * 3
+        xx, xy, yx, yy = Q_linear
+        Q_velocity = of_floats([xx, xy, 0.0, yx, yy, 0.0, 0.0, 0.0, turn_walk]).reshape(3, 3)
         ekf.move(Inputs(dt, gyro, screws, self._space.rotation[:2, :2]), Q_velocity, q, kept)
         self._space.advance(ekf.x[VELOCITY], dt)
 
-    def _turn(self, from_ns: int, until_ns: int, dt: float, Q_velocity: FloatArray) -> float | None:
-        """Take the IMU's samples of an interval; returns the turn rate with its bias, rad/s."""
+    def _turn(self, from_ns: int, until_ns: int, dt: float, walk: float) -> tuple[float | None, float]:
+        """Take the IMU's samples of an interval; the turn rate with its bias, rad/s, and its variance.
+
+        Without a gyro there is no rate, and the variance is that by which the turn rate walks.
+        """
         imu, comparison = self._imu, self._comparison
         samples = max(imu.samples, 1)
         rate = imu.mean_rate(from_ns, until_ns)
         gyro = self._space.turn(imu, rate, self._filter.x[VELOCITY], dt)
         if gyro is None:
             comparison.start(running=False)
-            return None
-        Q_velocity[2, 2] = self._settings.sigma_gyro**2 / samples
+            return None, walk
         if not comparison.running:
             comparison.start(running=True)
         else:
             if comparison.begins:
                 self._filter.begin_window()
             comparison.add_gyro(dt)
-        return gyro
+        return gyro, self._settings.sigma_gyro**2 / samples
