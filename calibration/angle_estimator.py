@@ -135,8 +135,13 @@ class AngleEstimator:
             (changed,) = (np.maximum.reduce(np.abs(step), axis=1) > SAME_DIRECTION).nonzero()
             if not len(changed):
                 break
-            more = step[changed].reshape(-1).dot(adds[changed].reshape(3 * len(changed), -1))
-            self._counted[changed] = moved[changed]
+            if 4 * len(changed) > len(step):
+                # To pick so many rows out takes longer than to go through all.
+                more = step.reshape(-1).dot(adds.reshape(step.size, -1))
+                self._counted[:] = moved
+            else:
+                more = step[changed].reshape(-1).dot(adds[changed].reshape(3 * len(changed), -1))
+                self._counted[changed] = moved[changed]
             self._added_mT = self._added_mT + more.reshape(-1, 3)
             if np.maximum.reduce(np.abs(more)) < NEGLIGIBLE_MT:
                 break
