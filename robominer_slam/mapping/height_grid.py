@@ -43,7 +43,7 @@ def height_grid(points: FloatArray, cell: float) -> HeightGrid:
     if not len(points):
         return HeightGrid((0.0, 0.0), cell, np.full((1, 1), np.nan))
     low = np.floor(points[:, :2].min(axis=0) / cell)
-    ij = np.floor(points[:, :2] / cell).astype(np.int64) - low.astype(np.int64)
+    ij = (np.floor(points[:, :2] / cell) - low).astype(np.intp)
     nx, ny = (int(n) for n in ij.max(axis=0) + 1)
     if nx * ny > MAX_CELLS:
         raise GridSizeError(f"a grid of {nx} x {ny} cells of {cell} m; expected at most {MAX_CELLS} cells")

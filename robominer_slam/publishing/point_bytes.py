@@ -58,7 +58,7 @@ def unpack_points(data: bytes, at: int, count: int) -> tuple[PointArray, int]:
     ends = np.flatnonzero(packed < _MORE)[:numbers]
     if len(ends) < numbers:
         raise PointBytesError(f"{count} points that are cut")
-    starts = np.concatenate([[0], ends[:-1] + 1]).astype(np.int64)
+    starts = np.concatenate([[0], ends[:-1] + 1]).astype(np.intp)
     if int((ends - starts).max()) >= _LONGEST:
         raise PointBytesError("a number of more than three bytes")
     size = int(ends[-1]) + 1

@@ -156,7 +156,7 @@ def _minima(
 
 
 def _binned(xy: FloatArray, z: FloatArray, shape: tuple[int, int], cell: float) -> tuple[FloatArray, FloatArray]:
-    ij = np.floor(xy / cell).astype(np.int64)
+    ij = np.floor(xy / cell).astype(np.intp)
     inside = ((ij >= 0) & (ij < np.array(shape))).all(axis=1)
     place = ij[inside, 0] * shape[1] + ij[inside, 1]
     size = shape[0] * shape[1]
@@ -191,7 +191,7 @@ def _transformed(at: FloatArray, weights: FloatArray, shape: tuple[int, int], ce
     Returns:
         Shape (w, k, *that of a transform).
     """
-    ij = np.floor(at / cell).astype(np.int64) % np.array(shape)  # a shift wraps round as the transform does
+    ij = np.floor(at / cell).astype(np.intp) % np.array(shape)  # a shift wraps round as the transform does
     k, size = len(at), shape[0] * shape[1]
     place = (ij[:, :, 0] * shape[1] + ij[:, :, 1] + np.arange(k)[:, None] * size).reshape(-1)
     sums = np.stack([np.bincount(place, weights=np.tile(w, k), minlength=k * size) for w in weights])

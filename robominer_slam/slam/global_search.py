@@ -109,7 +109,7 @@ class GlobalSearch:
         """L of every shift at one heading, and the patch's height over the map there; both flat."""
         c, s = np.cos(yaw), np.sin(yaw)
         at = np.column_stack([c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1]])
-        ij = np.floor(at / self._cell + 0.5).astype(np.int64) % np.array(self._shape)
+        ij = np.floor(at / self._cell + 0.5).astype(np.intp) % np.array(self._shape)
         place = ij[:, 0] * self._shape[1] + ij[:, 1]
         size = self._shape[0] * self._shape[1]
         sums = np.stack([np.bincount(place, weights=w, minlength=size) for w in (np.ones_like(z), z, z * z)])

@@ -130,7 +130,7 @@ class LoopGrowth:
         """Clusters of rejected loops that agree with each other, largest first; each a mask of shape (m,)."""
         out = np.flatnonzero(~self.accepted)
         label = self._clusters(out)
-        sizes = np.bincount(label[out])
+        sizes = np.bincount(label[out].astype(np.intp))
         return [label == k for k in np.argsort(-sizes, kind="stable") if sizes[k] >= 2]
 
     def _convincing(self, tests: Innovations, candidates: IndexArray, wrong: float) -> BoolArray:
@@ -143,7 +143,7 @@ class LoopGrowth:
 
     def _largest_cluster(self, passing: IndexArray, candidates: IndexArray) -> BoolArray:
         label = self._clusters(passing)
-        sizes = np.bincount(label[passing], minlength=1)
+        sizes = np.bincount(label[passing].astype(np.intp), minlength=1)
         if sizes.max() < 2:
             return np.zeros(candidates.size, dtype=np.bool_)
         return np.asarray(label[candidates] == int(sizes.argmax()))
