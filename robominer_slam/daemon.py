@@ -18,6 +18,7 @@ from robominer_slam.commands import Commands
 from robominer_slam.configuration.devices import device_settings
 from robominer_slam.configuration.model import Configuration
 from robominer_slam.frame_result import FrameResult
+from robominer_slam.load_shedding import LoadShedding, Shed
 from robominer_slam.map_service import MapService
 from robominer_slam.mapping.keyframe_map import KeyframeMap
 from robominer_slam.publisher import Publisher
@@ -78,6 +79,7 @@ class Daemon:
         self._commands = Commands(self._pipeline, self._map, store, self._new_map, relocalisation)
         self._saved_maps = SavedMaps(store.path, lambda: store.map_id, configuration.map.stream_cell)
         self._remote_status = RemoteStatus()
+        self._shedding = LoadShedding(configuration.load)
         self._last_frame: FrameResult | None = None
         self._telemetry_ns = self._status_ns = self._telemetry_count = 0
         self._declare_queries()
@@ -106,8 +108,13 @@ class Daemon:
     def _frame(self, result: FrameResult) -> None:
         for backend_result in result.backend_results:
             self._store.add(backend_result, self._clock.offset_ns)
-        self._map_service.frame(result)
-        self._publisher.frame(result)
+        sparing = self._shedding.level >= Shed.MAP_DETAIL
+        # Poses first: whatever else there is to do can wait for them.
+        self._publisher.frame(result, sparing=sparing)
+        self._map_service.frame(result, sparing=sparing)
+        runner = self._pipeline.runner
+        behind_s = 0.0 if runner is None else runner.behind_ns * 1e-9
+        self._shedding.frame((time.monotonic_ns() - result.stamp_ns) * 1e-9, behind_s)
         if result.stamp_ns - self._telemetry_ns >= TELEMETRY_INTERVAL_NS:
             self._telemetry_ns = result.stamp_ns
             self._telemetry(result)
@@ -134,6 +141,8 @@ class Daemon:
             health |= Health.STORE_FAILING
         if self._pipeline.paused:
             health |= Health.PAUSED
+        if self._shedding.level >= Shed.LOOP_SEARCH:
+            health |= Health.BACKEND_LATE
         if self._source.dropped:
             health |= Health.MEASUREMENTS_DROPPED
         return health
@@ -143,6 +152,7 @@ class Daemon:
         if now - self._status_ns < STATUS_INTERVAL_NS:
             return
         self._status_ns = now
+        self._pipeline.shed = self._shedding.turn(now * 1e-9)
         stamp = self._clock.unix_ns(now)
         entries = self._diagnostics(now)
         self._bus.put("status", report_messages.diagnostics(stamp, entries))
@@ -170,6 +180,7 @@ class Daemon:
         entries = [
             status_report.slam_diagnostic(frame, age_s, self._pipeline, self._map, self._map_service.digest),
             status_report.process_diagnostic(self._clock, self._source.dropped),
+            status_report.load_diagnostic(self._shedding),
             status_report.store_diagnostic(self._store),
             *(status_report.device_diagnostic(device) for device in self._source.status()),
         ]

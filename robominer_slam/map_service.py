@@ -21,6 +21,8 @@ from robominer_slam.slam.saved_map import SavedMap
 from robominer_slam.wall_clock import WallClock
 
 PATH_INTERVAL_NS = 1_000_000_000
+#: Changes and path are told so often where the computer cannot keep up.
+SPARING_INTERVAL_NS = 5_000_000_000
 
 
 class MapService:
@@ -43,15 +45,21 @@ class MapService:
         self.section = section
         self._publisher = self._new_publisher()
         self._path_ns: int | None = None
+        self._told_ns: int | None = None
         self._path_version = 0
+        self._untold = False
 
-    def frame(self, result: FrameResult) -> None:
-        """Take what the back-end found, and publish what changed."""
+    def frame(self, result: FrameResult, *, sparing: bool = False) -> None:
+        """Take what the back-end found, and publish what changed; more seldom where it shall be sparing."""
         for backend_result in result.backend_results:
             self.keyframe_map.take(backend_result)
-        if result.backend_results:
+        self._untold = self._untold or bool(result.backend_results)
+        pause_ns = SPARING_INTERVAL_NS if sparing else 0
+        if self._untold and (self._told_ns is None or result.stamp_ns - self._told_ns >= pause_ns):
+            self._told_ns, self._untold = result.stamp_ns, False
             self._publish_updates()
-        due = self._path_ns is None or result.stamp_ns - self._path_ns >= PATH_INTERVAL_NS
+        pause_ns = max(PATH_INTERVAL_NS, pause_ns)
+        due = self._path_ns is None or result.stamp_ns - self._path_ns >= pause_ns
         if due and self._path_version != self.keyframe_map.version:
             self._path_ns = result.stamp_ns
             self._path_version = self.keyframe_map.version

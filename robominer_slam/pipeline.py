@@ -23,6 +23,7 @@ from robominer_slam.estimation.odometry_state import (
     TellsMotion,
 )
 from robominer_slam.frame_result import FrameResult, LocalizationState
+from robominer_slam.load_shedding import Shed
 from robominer_slam.reorder import ReorderBuffer
 from robominer_slam.slam.backend_runner import BackendRunner
 from robominer_slam.slam.composite_scan import CompositeScan
@@ -77,6 +78,7 @@ class Pipeline:
         self.monitor = monitor
         self.runner = runner
         self.paused = False
+        self.shed = Shed.NOTHING
         self.wrong_size_frames = 0
         self.stale_frames = 0
         self._dead_reckoning = dead_reckoning
@@ -101,6 +103,7 @@ class Pipeline:
         self._contact_ns: int | None = None
         self._odometry_ns: int | None = None
         self._last_frame: HallFrame | None = None
+        self._unmatched = False
 
     def add(self, device: str, measurement: Measurement) -> list[FrameResult]:
         """Take a measurement of a device; returns the results of the frames that it releases."""
@@ -217,6 +220,13 @@ class Pipeline:
         scans, reckoning = self._scan_odometry, self._takes_matches
         if scans is None or reckoning is None:
             return odometry
+        if self.shed >= Shed.MATCHING:
+            self._unmatched = True
+            return odometry
+        if self._unmatched:
+            # The ground touched before is far behind by now.
+            scans.clear()
+            self._unmatched = False
         level, tilt = geometry.levelled(planar_pose(odometry))
         points = points @ tilt.T
         covariance = np.zeros((4, 4))
@@ -253,6 +263,8 @@ class Pipeline:
         if keyframe is not None:
             if self._tells is not None:
                 keyframe = replace(keyframe, motion=self._tells.mark_keyframe(stamp))
+            if self.shed >= Shed.LOOP_SEARCH:
+                keyframe = replace(keyframe, searched=False)
             if self._scan_odometry is not None:
                 keyframe = replace(keyframe, breaks=self._scan_odometry.breaks)
             if self._prior is not None:

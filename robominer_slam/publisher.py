@@ -20,6 +20,8 @@ MAP, ODOM, BASE = "map", "odom", "base_link"
 LEVEL_VARIANCE = (1e-4, 1e-4, 1e-4)
 #: While the pose is not known, it carries a sigma of 10 m.
 UNKNOWN_VARIANCE_M2 = 100.0
+#: Contacts go out with each frame, or with one of so many where the computer cannot keep up.
+SPARING_FRAMES = 5
 #: Positions of (x, y, yaw) and of (z, roll, pitch) in a 6 x 6 covariance.
 PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 LEVEL = ([2, 3, 4], [2, 3, 4])
@@ -52,8 +54,8 @@ class Publisher:
         ]
         bus.latch("tf_static", pose_messages.transforms(mounts))
 
-    def frame(self, result: FrameResult) -> None:
-        """Publish one frame's result."""
+    def frame(self, result: FrameResult, *, sparing: bool = False) -> None:
+        """Publish one frame's result; the contacts of every fifth one only where it shall be sparing."""
         stamp = self._clock.unix_ns(result.stamp_ns)
         odometry = result.odometry
         odom_pose = geometry.to_vector7(result.T_odom_base)
@@ -82,7 +84,8 @@ class Publisher:
             transforms.insert(0, StampedTransform(stamp, MAP, ODOM, geometry.to_vector7(result.T_map_odom)))
         self._bus.put("tf", pose_messages.transforms(transforms))
         contacts = result.contacts
-        if self._bus.wanted("whiskers/points"):
+        spared = sparing and self.frames % SPARING_FRAMES
+        if not spared and self._bus.wanted("whiskers/points"):
             self._bus.put(
                 "whiskers/points",
                 cloud_messages.contact_cloud(

@@ -11,6 +11,7 @@ import numpy as np
 from drivers.device import DeviceStatus
 from robominer_slam.frame_result import FrameResult
 from robominer_slam.layout import WhiskerLayout
+from robominer_slam.load_shedding import WORDS, LoadShedding, Shed
 from robominer_slam.mapping.keyframe_map import KeyframeMap
 from robominer_slam.pipeline import Pipeline
 from robominer_slam.publishing.report_messages import Diagnostic, Level
@@ -96,6 +97,18 @@ def whiskers_diagnostic(frame: FrameResult, layout: WhiskerLayout, pipeline: Pip
         text = f"{len(invalid)} without a usable reading: {' '.join(invalid)}"
         return Diagnostic("whiskers", Level.WARN, text, values)
     return Diagnostic("whiskers", Level.OK, "all readings usable", values)
+
+
+def load_diagnostic(shedding: LoadShedding) -> Diagnostic:
+    """Whether the computer keeps up with the robot, and what is left undone where it does not."""
+    values = {
+        "lag_s": f"{shedding.lag_s:.3f}",
+        "backend.behind_s": f"{shedding.behind_s:.2f}",
+        "level": str(int(shedding.level)),
+        "times": str(shedding.times),
+    }
+    level = Level.OK if shedding.level is Shed.NOTHING else Level.WARN
+    return Diagnostic("load", level, WORDS[shedding.level], values)
 
 
 def store_diagnostic(store: MapStore) -> Diagnostic:

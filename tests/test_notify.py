@@ -25,10 +25,10 @@ HANGING = """
 import pathlib, sys, time
 from robominer_slam import publisher
 frame, hang = publisher.Publisher.frame, pathlib.Path(sys.argv.pop())
-def hanging(self, result):
+def hanging(self, result, **options):
     while hang.exists():
         time.sleep(0.05)
-    frame(self, result)
+    frame(self, result, **options)
 publisher.Publisher.frame = hanging
 from robominer_slam.cli.main import main
 main()

@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import Field, ValidationInfo, field_validator
 
 from robominer_slam.configuration.device_section import DeviceSection
+from robominer_slam.configuration.load_section import LoadSection
 from robominer_slam.configuration.log_section import LogSection
 from robominer_slam.configuration.parameter import KeyChunk, Section, is_ros_name, parameter
 from robominer_slam.configuration.robust_estimation_section import RobustEstimationSection
@@ -281,6 +282,7 @@ class Configuration(Section):
     map: MapSection = Field(default_factory=MapSection)
     store: StoreSection = Field(default_factory=StoreSection)
     zenoh: ZenohSection = Field(default_factory=ZenohSection)
+    load: LoadSection = Field(default_factory=LoadSection)
     log: LogSection = Field(default_factory=LogSection)
 
     @field_validator("zenoh")

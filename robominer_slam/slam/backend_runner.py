@@ -22,11 +22,13 @@ class BackendRunner(Protocol):
     Attributes:
         late: results that were not ready when due.
         max_late_ns: by how much at the most, in sensor time.
+        behind_ns: by how much the result that is due next is late now.
         busy_s: time the back-end has computed, s.
     """
 
     late: int
     max_late_ns: int
+    behind_ns: int
     busy_s: float
 
     def submit(self, keyframe: Keyframe) -> None:
@@ -51,6 +53,7 @@ class SynchronousRunner:
         self._results: deque[BackendResult] = deque()
         self.late = 0
         self.max_late_ns = 0
+        self.behind_ns = 0
         self.busy_s = 0.0
 
     def submit(self, keyframe: Keyframe) -> None:
@@ -94,6 +97,7 @@ class ThreadedRunner:
         self._thread.start()
         self.late = 0
         self.max_late_ns = 0
+        self.behind_ns = 0
         self.busy_s = 0.0
 
     def submit(self, keyframe: Keyframe) -> None:
@@ -114,6 +118,7 @@ class ThreadedRunner:
     def due(self, stamp_ns: int) -> list[BackendResult]:
         """Results that take effect at or before this sensor time, in order."""
         self._check()
+        self.behind_ns = 0
         due = []
         while self._waiting and self._waiting[0] + self._latency_ns <= stamp_ns:
             late_ns = stamp_ns - self._waiting[0] - self._latency_ns
@@ -122,6 +127,7 @@ class ThreadedRunner:
                     self._counted_late = self._waiting[0]
                     self.late += 1
                 self.max_late_ns = max(self.max_late_ns, late_ns)
+                self.behind_ns = late_ns
                 break
             self._waiting.popleft()
             due.append(self._results.popleft())

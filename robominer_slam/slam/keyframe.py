@@ -29,6 +29,7 @@ class Keyframe:
         motion: since the keyframe before, where the dead reckoning tells its noise and biases apart.
         breaks: how often so far the ground has ceased to be the one touched just before: carried, or fallen.
         prior: where the operator says that this keyframe is; the way from the keyframe before is then not known.
+        searched: whether loop closures are to be searched for it; not where the computer cannot keep up.
     """
 
     id: int
@@ -40,6 +41,7 @@ class Keyframe:
     floor: NDArray[np.bool_] | None = None
     breaks: int = 0
     prior: PlacePrior | None = None
+    searched: bool = True
 
     @property
     def floor_points(self) -> FloatArray:

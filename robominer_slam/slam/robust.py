@@ -85,7 +85,8 @@ class RobustBackend:
         """Add a keyframe, search for loop closures, optimise."""
         self._map.begin(keyframe.id, keyframe.floor is None or bool(keyframe.floor.all()))
         self._add_node(keyframe)
-        accepted = self._agreed(self._found(keyframe)) if self._is_searched(keyframe.id) else []
+        searched = keyframe.searched and self._is_searched(keyframe.id)
+        accepted = self._agreed(self._found(keyframe)) if searched else []
         for closure in accepted:
             self._add_loop(closure)
         if accepted:

@@ -55,7 +55,7 @@ class ThesisBackend:
         else:
             self._add_node(keyframe, target, keyframe.T_odom_base)
         closures = 0
-        found = self._search(keyframe, target)
+        found = self._search(keyframe, target) if keyframe.searched else None
         if found is not None:
             candidate, match = found
             self._add_edge("loop", candidate, match.T_target_source, information_from_fitness(match.fitness))
