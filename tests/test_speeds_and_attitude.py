@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from drivers.bno08x_rvc import quaternion
-from drivers.measurement import HallFrame, ImuSample, ScrewSpeeds
+from drivers.measurement import HallFrame, ImuSample, ScrewAngles, ScrewSpeeds
 from robominer_slam.configuration.model import EstimationSection
 from robominer_slam.estimation.attitude_increments import AttitudeIncrements, rotation_between
 from robominer_slam.estimation.fused_odometry import FusedOdometry
 from robominer_slam.estimation.screw_kinematics import forward_matrix
-from robominer_slam.estimation.screw_speeds import ScrewSpeedAssembly
+from robominer_slam.estimation.screw_speeds import ScrewAngleSpeeds, ScrewSpeedAssembly
 from tests.test_pipeline import frame, model, pipeline_of
 
 __all__ = ["model"]  # a fixture
@@ -111,3 +111,18 @@ def test_spherical_frames_are_used_and_directions_alone_touch_nothing(model):
         spherical = HallFrame(0, np.stack([*angles, magnitude], axis=-1), cartesian.valid, 0, "Spherical")
         (result,) = pipeline_of(model, "").add("whiskers", spherical)
         assert len(result.contacts.index) == touching
+
+
+def test_screw_angles_that_come_too_soon_are_passed_over_and_lose_nothing():
+    speeds = ScrewAngleSpeeds(30_000_000)
+    angle, told = np.zeros(4), []
+    for k in range(9):
+        stamp = k * 20_000_000
+        speed = speeds.add(ScrewAngles(stamp, angle.copy()))
+        if speed is not None:
+            told.append((stamp, speed[0], speeds.readings))
+        angle += 0.02 * (1.0 + k)
+    # The mean over both intervals, also where the speed changes in between.
+    assert [(stamp, readings) for stamp, _, readings in told] == [(40_000_000 * k, 2) for k in range(1, 5)]
+    np.testing.assert_allclose([speed for _, speed, _ in told], [1.5, 3.5, 5.5, 7.5])
+    assert speeds.stale == 0

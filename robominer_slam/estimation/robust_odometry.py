@@ -48,6 +48,8 @@ from robominer_slam.float_array import of_floats
 FloatArray = NDArray[np.float64]
 Source = Literal["fused", "odometry"]
 
+#: Encoders may be read fifty or a hundred times a second: the filter moves on less often than that.
+LEAST_SCREW_INTERVAL_NS = 30_000_000
 #: Squared deviations between screws and gyro beyond which the screws are trusted less.
 DISAGREEMENT = 4.0
 
@@ -90,7 +92,7 @@ class RobustOdometry:
         self._distrust = 1.0
         self._stamp_ns: int | None = None
         self._marked_ns: int | None = None
-        self._angles = ScrewAngleSpeeds()
+        self._angles = ScrewAngleSpeeds(LEAST_SCREW_INTERVAL_NS)
         self._odometry_ns: int | None = None
         self._screws_ns: int | None = None
         self._input = np.zeros(2)
@@ -110,9 +112,9 @@ class RobustOdometry:
             case ImuSample():
                 self._imu.add(measurement)
             case ScrewAngles():
-                self._take_speed(measurement.stamp_ns, self._angles.add(measurement))
+                self._take_speed(measurement.stamp_ns, self._angles.add(measurement), self._angles.readings)
             case ScrewSpeeds():
-                self._take_speed(measurement.stamp_ns, self._speeds.add(measurement))
+                self._take_speed(measurement.stamp_ns, self._speeds.add(measurement), 1)
 
     def add_contacts(self, stamp_ns: int, contacts: Contacts) -> None:
         """Take the contacts of a whisker frame; `state_at` then knows of them."""
@@ -231,7 +233,8 @@ class RobustOdometry:
         x = self._filter.x
         self._filter.correct(sample.velocity - self._H_odometry @ x, self._H_odometry, variance * np.eye(3))
 
-    def _take_speed(self, stamp_ns: int, speed: FloatArray | None) -> None:
+    def _take_speed(self, stamp_ns: int, speed: FloatArray | None, readings: int) -> None:
+        """Take the screws' speeds, the mean of so many readings."""
         if speed is None:
             return
         before, self._screws_ns = self._screws_ns, stamp_ns
@@ -247,7 +250,7 @@ class RobustOdometry:
             creep = settings.sigma_still**2
             self._Q_input = [creep, 0.0, 0.0, creep]
         else:
-            mode, distrust = (settings.slip_mode_weight * slip) ** 2, self._distrust
+            mode, distrust = (settings.slip_mode_weight * slip) ** 2 / readings, self._distrust / readings
             xx, xy, yx, yy = self._R_linear
             self._Q_input = [xx * distrust + mode, xy * distrust, yx * distrust, yy * distrust + mode]
         self._predict(stamp_ns)
@@ -256,7 +259,7 @@ class RobustOdometry:
         if not comparison.running:
             # Without a gyro, the screws are all that says how fast the body turns.
             self._filter.correct(*comparison.screws_alone(self._filter.x, wz, still, settings))
-        elif comparison.add_screws(wz * (stamp_ns - before) * 1e-9, still):
+        elif comparison.add_screws(wz * (stamp_ns - before) * 1e-9, still, readings):
             distance = self._filter.correct(*comparison.measurement(self._filter.x))
             self._distrust = max(1.0, distance / DISAGREEMENT)
             comparison.start(running=True)

@@ -18,17 +18,30 @@ MAX_INTERVAL_S = 0.5
 class ScrewAngleSpeeds:
     """Mean speeds between readings of the screws' cumulative angles.
 
+    Readings that follow each other closely may be passed over: the angles add up, so the next one tells all of it.
+
+    Args:
+        least_interval_ns: readings sooner than this after the last one used are passed over.
+
     Attributes:
         stale: readings that gave none, out of order or after a gap.
+        readings: how many readings the last speeds are of.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, least_interval_ns: int = 0) -> None:
+        self._least_interval_ns = least_interval_ns
         self._before: ScrewAngles | None = None
+        self._passed_over = 0
         self.stale = 0
+        self.readings = 0
 
     def add(self, reading: ScrewAngles) -> FloatArray | None:
-        """Speeds since the reading before, shape (4,), rad/s; None for the first and where the gap is too long."""
-        before, self._before = self._before, reading
+        """Speeds since the last reading used, shape (4,), rad/s; None for the first and where the gap is too long."""
+        before = self._before
+        if before is not None and 0 < reading.stamp_ns - before.stamp_ns < self._least_interval_ns:
+            self._passed_over += 1
+            return None
+        self._before, self.readings, self._passed_over = reading, self._passed_over + 1, 0
         if before is None:
             return None
         interval = (reading.stamp_ns - before.stamp_ns) * 1e-9

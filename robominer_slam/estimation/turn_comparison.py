@@ -81,10 +81,10 @@ class TurnComparison:
         """The gyro has turned the filter's heading for `dt` seconds."""
         self._span += dt
 
-    def add_screws(self, angle: float, still: bool) -> bool:
-        """The screws say `angle`, rad, since their last reading; True once a window is full."""
+    def add_screws(self, angle: float, still: bool, readings: int = 1) -> bool:
+        """The screws say `angle`, rad, in their last readings; True once a window is full."""
         self._screws += angle
-        self._readings += 1
+        self._readings += readings
         self._still = self._still and still
         return self._span >= WINDOW_S
 
