@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robominer_slam import geometry
+from robominer_slam.float_array import of_floats
 from robominer_slam.frame_result import FrameResult
 from robominer_slam.layout import WhiskerLayout
 from robominer_slam.publishing import cloud_messages, pose_messages
@@ -22,17 +23,21 @@ LEVEL_VARIANCE = (1e-4, 1e-4, 1e-4)
 UNKNOWN_VARIANCE_M2 = 100.0
 #: Contacts go out with each frame, or with one of so many where the computer cannot keep up.
 SPARING_FRAMES = 5
-#: Positions of (x, y, yaw) and of (z, roll, pitch) in a 6 x 6 covariance.
-PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
-LEVEL = ([2, 3, 4], [2, 3, 4])
 
 
 def full_covariance(planar: FloatArray) -> FloatArray:
     """Covariance (6, 6) in ROS order of one over (x, y, yaw)."""
-    covariance = np.zeros((6, 6))
-    covariance[PLANAR] = planar
-    covariance[LEVEL] = LEVEL_VARIANCE
-    return covariance
+    (xx, xy, xw), (yx, yy, yw), (wx, wy, ww) = planar.tolist()
+    z, roll, pitch = LEVEL_VARIANCE
+    rows = [
+        xx, xy, 0.0, 0.0, 0.0, xw,
+        yx, yy, 0.0, 0.0, 0.0, yw,
+        0.0, 0.0, z, 0.0, 0.0, 0.0,
+        0.0, 0.0, 0.0, roll, 0.0, 0.0,
+        0.0, 0.0, 0.0, 0.0, pitch, 0.0,
+        wx, wy, 0.0, 0.0, 0.0, ww,
+    ]  # fmt: skip
+    return of_floats(rows).reshape(6, 6)
 
 
 class Publisher:

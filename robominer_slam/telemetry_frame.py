@@ -30,7 +30,7 @@ def telemetry(
             stamp_ns=stamp_unix_ns,
             state=result.state,
             pose=geometry.to_vector7(result.T_map_base),
-            sigmas=np.sqrt(np.diag(full_covariance(result.covariance))),
+            sigmas=np.sqrt(full_covariance(result.covariance).diagonal()),
             velocity=result.odometry.velocity,
             contacts=len(result.contacts.index),
             inclination=inclination.reshape(shape),

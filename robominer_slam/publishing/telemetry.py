@@ -26,6 +26,7 @@ from -180 degrees. The middle of a step errs by at most 3.2 degrees in inclinati
 
 from __future__ import annotations
 
+import math
 import struct
 from dataclasses import dataclass
 from enum import IntFlag
@@ -49,7 +50,7 @@ _AZIMUTH_STEPS = 16
 _AZIMUTH_STEP = 2 * np.pi / _AZIMUTH_STEPS
 _FREE, _INVALID = 0, 15
 #: Units of the sigmas, per m and per rad, and of the velocity.
-_SIGMA_UNITS = np.array([1e3, 1e3, 1e3, 1e4, 1e4, 1e4])
+_SIGMA_UNITS = (1e3, 1e3, 1e3, 1e4, 1e4, 1e4)
 _VELOCITY_UNITS = 1e3
 
 
@@ -113,23 +114,22 @@ def encode(telemetry: Telemetry) -> bytes:
     """
     if telemetry.state not in STATES:
         raise TelemetryError(f"localization state {telemetry.state!r}, expected one of {STATES}")
-    if not (np.isfinite(telemetry.pose).all() and np.isfinite(telemetry.velocity).all()):
+    pose, velocity = telemetry.pose.tolist(), telemetry.velocity.tolist()
+    if not all(map(math.isfinite, (*pose, *velocity))):
         raise TelemetryError("a pose or velocity that is not finite")
     rows, cols = telemetry.inclination.shape
     if rows * cols > MAX_WHISKERS or rows > 255 or cols > 255:
         rows = cols = 0
-    # Not finite or beyond the range both mean: as good as unknown.
-    sigmas = np.where(np.isfinite(telemetry.sigmas), telemetry.sigmas * _SIGMA_UNITS, 65535.0)
-    velocity = np.clip(np.rint(telemetry.velocity * _VELOCITY_UNITS), -32768, 32767)
+    sigmas = zip(telemetry.sigmas.tolist(), _SIGMA_UNITS, strict=True)
     head = _HEAD.pack(
         VERSION,
         STATES.index(telemetry.state),
         int(telemetry.health),
         telemetry.sequence & 0xFFFF,
         telemetry.stamp_ns,
-        *(float(value) for value in telemetry.pose),
-        *(int(value) for value in np.clip(np.rint(sigmas), 0, 65535)),
-        *(int(value) for value in velocity),
+        *pose,
+        *(_sigma_steps(sigma * unit) for sigma, unit in sigmas),
+        *(min(max(round(value * _VELOCITY_UNITS), -32768), 32767) for value in velocity),
         telemetry.map_version & 0xFFFFFFFF,
         min(telemetry.keyframes, 0xFFFFFFFF),
         min(telemetry.closures, 0xFFFF),
@@ -138,6 +138,11 @@ def encode(telemetry: Telemetry) -> bytes:
         cols,
     )
     return head + (_pack_whiskers(telemetry.inclination, telemetry.azimuth) if rows else b"")
+
+
+def _sigma_steps(value: float) -> int:
+    # Not finite or beyond the range both mean: as good as unknown.
+    return min(max(round(value), 0), 65535) if math.isfinite(value) else 65535
 
 
 def decode(data: bytes) -> Telemetry:
@@ -163,7 +168,7 @@ def decode(data: bytes) -> Telemetry:
         stamp_ns=stamp_ns,
         state=STATES[state],
         pose=pose,
-        sigmas=np.array(numbers[7:13]) / _SIGMA_UNITS,
+        sigmas=np.array(numbers[7:13]) / np.array(_SIGMA_UNITS),
         velocity=np.array(numbers[13:16]) / _VELOCITY_UNITS,
         contacts=numbers[19],
         inclination=inclination.reshape(rows, cols),
