@@ -110,17 +110,24 @@ def quantiles(values: np.ndarray) -> str:
 @click.command()
 @click.option("--minutes", default=10.0, show_default=True, help="How long memory is watched.")
 @click.option("--points/--no-points", "large", default=True, help="With the large map, or from an empty one.")
+@click.option(
+    "--keyframes", type=int, help="At most so many in the robot's map, as in a bounded one; default: no limit."
+)
+@click.option("--window", default="1440x900", show_default=True, help="Size of the page, pixels.")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("out/operator"), show_default=True)
-def main(minutes: float, large: bool, out: Path) -> None:
+def main(minutes: float, large: bool, keyframes: int | None, window: str, out: Path) -> None:
     """Measure and print a table."""
     out.mkdir(parents=True, exist_ok=True)
-    robot = PublishedRobot(f"tcp/127.0.0.1:{free_port()}", points=60, keyframe_m=KEYFRAME_M if large else STEP_M)
+    robot = PublishedRobot(
+        f"tcp/127.0.0.1:{free_port()}", points=60, keyframe_m=KEYFRAME_M if large else STEP_M, most_keyframes=keyframes
+    )
     if large:
         robot.preload(*large_map())
     rows: list[tuple[str, str]] = []
     with robot, console(out / "operator.log", "--connect", robot.endpoint) as address, browser() as chromium:
         begin = time.monotonic()
-        page = opened(chromium, address, 1440, 900)
+        width, height = map(int, window.split("x"))
+        page = opened(chromium, address, width, height)
         wanted = 990_000 if large else 1
         page.wait_for_function(
             f"parseInt((document.querySelector('.map-count')?.textContent ?? '0').replaceAll(',', '')) >= {wanted}",

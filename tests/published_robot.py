@@ -70,8 +70,10 @@ class PublishedRobot:
         remote: bool = False,
         points: int = 60,
         keyframe_m: float = KEYFRAME_M,
+        most_keyframes: int | None = None,
         settings: ZenohSettings | None = None,
     ) -> None:
+        self._most, self._made = most_keyframes, 0
         self._settings = settings or ZenohSettings(listen=(endpoint,))
         self.endpoint, self._remote, self._points, self._keyframe_m = endpoint, remote, points, keyframe_m
         self.bend: dict[int, float] = dict.fromkeys(range(16, 24), math.radians(20.0))
@@ -187,9 +189,12 @@ class PublishedRobot:
     def map_step(self) -> None:
         """Another keyframe where the robot is."""
         with self.lock:
-            made = keyframe(len(self.keyframes), self.pose(), self._points, self._rng)
+            made = keyframe(self._made, self.pose(), self._points, self._rng)
+            self._made += 1
             vector = geometry.to_vector7(geometry.T_from_xyyaw(self.pose()))
-            self.publish_map([*self.keyframes, made], np.vstack([self.poses, vector]))
+            # A bounded map forgets its oldest.
+            kept = slice(None) if self._most is None else slice(-self._most, None)
+            self.publish_map([*self.keyframes, made][kept], np.vstack([self.poses, vector])[kept])
 
     def publish_map(self, keyframes: list[MadeKeyframe], poses: np.ndarray) -> None:
         """The caller holds the lock."""
@@ -201,6 +206,7 @@ class PublishedRobot:
     def begin_map(self) -> None:
         """Another map, empty at first."""
         with self.lock:
+            self._made = 0
             self._encoder = MapStreamEncoder(0x5678)
             self.publish_map([], np.zeros((0, 7)))
 
@@ -208,6 +214,7 @@ class PublishedRobot:
         """A map that is there before the robot is switched on."""
         self.keyframes, self.poses = keyframes, poses
         self.version += 1
+        self._made = len(keyframes)
         self._encoder.update(self.version, keyframes, poses)
 
     def _publish_pose(self, stamp: int) -> None:
