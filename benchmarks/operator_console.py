@@ -110,9 +110,7 @@ def quantiles(values: np.ndarray) -> str:
 @click.command()
 @click.option("--minutes", default=10.0, show_default=True, help="How long memory is watched.")
 @click.option("--points/--no-points", "large", default=True, help="With the large map, or from an empty one.")
-@click.option(
-    "--keyframes", type=int, help="Most in the robot's map, as in a bounded one; default: no limit."
-)
+@click.option("--keyframes", type=int, help="Most in the robot's map, as in a bounded one; default: no limit.")
 @click.option("--window", default="1440x900", show_default=True, help="Size of the page, pixels.")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("out/operator"), show_default=True)
 def main(minutes: float, large: bool, keyframes: int | None, window: str, out: Path) -> None:
