@@ -24,9 +24,9 @@ from drivers.recording_reader import Recording
 from robominer_slam.configuration.model import ThesisSection
 from robominer_slam.contacts import ContactModel
 from robominer_slam.estimation.integrated_odometry import IntegratedOdometry
+from robominer_slam.estimation.odometry_state import planar_pose
 from robominer_slam.evaluation.trajectory import Trajectory, interpolate
 from robominer_slam.geometry import from_vector7
-from robominer_slam.pipeline import planar_pose
 from robominer_slam.replay import prepare
 from robominer_slam.slam.backend_runner import SynchronousRunner
 from robominer_slam.slam.composite_scan import CompositeScan

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -21,9 +20,11 @@ from robominer_slam.estimation.odometry_state import (
     OdometryState,
     TakesScanMatches,
     TellsMotion,
+    planar_pose,
 )
 from robominer_slam.frame_result import FrameResult, LocalizationState
 from robominer_slam.load_shedding import Shed
+from robominer_slam.map_pose import MapPose
 from robominer_slam.reorder import ReorderBuffer
 from robominer_slam.slam.backend_runner import BackendRunner
 from robominer_slam.slam.composite_scan import CompositeScan
@@ -95,11 +96,7 @@ class Pipeline:
         self._prior: PlacePrior | None = None
         self._sought_from = -1
         self._breaks = 0
-        self._T_map_odom = np.eye(4)
-        self._last_result: BackendResult | None = None
-        self._odometry_at_result: FloatArray | None = None
-        self._odometry_of_keyframe: dict[int, FloatArray] = {}
-        self._first_keyframe_covariance = np.zeros((3, 3))
+        self._map_pose = MapPose()
         self._contact_ns: int | None = None
         self._odometry_ns: int | None = None
         self._last_frame: HallFrame | None = None
@@ -116,7 +113,7 @@ class Pipeline:
     @property
     def backend_counts(self) -> Mapping[str, int]:
         """What the back-end had counted at its last result, by name."""
-        return {} if self._last_result is None else self._last_result.counts
+        return self._map_pose.counts
 
     def rezero(self) -> bool:
         """Take the last frame as the array's rest position; False if there was none."""
@@ -129,8 +126,7 @@ class Pipeline:
     def localize(self, x: float, y: float, yaw: float) -> None:
         """Place the robot: map -> odom such that base_link is at (x, y) with heading yaw (m, rad) now."""
         stamp = self._last_frame.stamp_ns if self._last_frame is not None else 0
-        T_odom_base = planar_pose(self._dead_reckoning.state_at(stamp))
-        self._T_map_odom = geometry.T_from_xyyaw([x, y, yaw]) @ geometry.inverse(T_odom_base)
+        self._map_pose.place(x, y, yaw, planar_pose(self._dead_reckoning.state_at(stamp)))
 
     def localize_by_touch(self, prior: PlacePrior) -> None:
         """Look for the place in the map from now on, near the prior first; it counts once touches confirm it."""
@@ -146,9 +142,7 @@ class Pipeline:
         if self.runner is not None:
             self.runner.close()
         self._composite, self.runner = composite_scan, runner
-        self._T_map_odom = np.eye(4)
-        self._last_result = self._odometry_at_result = None
-        self._odometry_of_keyframe.clear()
+        self._map_pose.begin()
         self.localised, self._prior, self._sought_from = True, None, -1
 
     def _process(self, due: list[tuple[str, Measurement]]) -> list[FrameResult]:
@@ -200,13 +194,14 @@ class Pipeline:
             self._take(result)
         keyframe = self._keyframe(stamp, T_odom_base, contacts.points, floor, odometry)
         state = self._state(stamp)
+        T_map_odom = self._map_pose.T_map_odom
         return FrameResult(
             stamp_ns=stamp,
             odometry=odometry,
             T_odom_base=T_odom_base,
-            T_map_odom=self._T_map_odom,
-            T_map_base=self._T_map_odom @ T_odom_base,
-            covariance=self._covariance(odometry) if self.localised else UNKNOWN_COVARIANCE,
+            T_map_odom=T_map_odom,
+            T_map_base=T_map_odom @ T_odom_base,
+            covariance=self._map_pose.covariance(odometry) if self.localised else UNKNOWN_COVARIANCE,
             angles=angles,
             whisker_states=self.monitor.health.states(),
             contacts=contacts,
@@ -269,41 +264,21 @@ class Pipeline:
                 keyframe = replace(keyframe, breaks=self._scan_odometry.breaks)
             if self._prior is not None:
                 # Told some way before the keyframe was complete.
-                x, y, yaw, _ = geometry.levelled(self._T_map_odom @ T_odom_base)[0].tolist()
+                x, y, yaw, _ = geometry.levelled(self._map_pose.T_map_odom @ T_odom_base)[0].tolist()
                 keyframe = replace(keyframe, prior=replace(self._prior, x=x, y=y, yaw=yaw))
                 self._prior, self._sought_from = None, keyframe.id
-            self._odometry_of_keyframe[keyframe.id] = odometry.covariance
-            if keyframe.id == 0:
-                self._first_keyframe_covariance = odometry.covariance
+            self._map_pose.keyframe(keyframe, odometry)
             self.runner.submit(keyframe)
         return keyframe
 
     def _take(self, result: BackendResult) -> None:
-        self._last_result = result
-        self._odometry_at_result = self._odometry_of_keyframe.pop(result.keyframe.id)
+        self._map_pose.take(result)
         if self._prior is not None or result.keyframe.id < self._sought_from:
             # Computed before the operator told the place.
             return
         self.localised = result.localised
         if result.localised:
-            self._T_map_odom = result.T_map_odom
-
-    def _covariance(self, odometry: OdometryState) -> FloatArray:
-        """Covariance of (x, y, yaw) in map: the keyframe's, grown by odometry since.
-
-        The graph takes its first keyframe as exact; the way to it from the map's origin was odometry's.
-        """
-        c, s = self._T_map_odom[:2, 0].tolist()
-        if self._last_result is None or self._odometry_at_result is None:
-            R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-            covariance: FloatArray = R @ odometry.covariance @ R.T
-            return covariance
-        grown = (odometry.covariance - self._odometry_at_result).diagonal().tolist()
-        x, y, yaw = (max(variance, 0.0) for variance in grown)
-        xy = c * s * (x - y)
-        turned = np.array([[c * c * x + s * s * y, xy, 0.0], [xy, s * s * x + c * c * y, 0.0], [0.0, 0.0, yaw]])
-        covariance = self._first_keyframe_covariance + self._last_result.covariance + turned
-        return covariance
+            self._map_pose.correct(result)
 
     def _state(self, stamp: int) -> LocalizationState:
         if self._odometry_ns is None:
@@ -316,11 +291,3 @@ class Pipeline:
         if self.runner is None or self._contact_ns is None or stamp - self._contact_ns > BLIND_NS or self.paused:
             return "dead_reckoning"
         return "tracking"
-
-
-def planar_pose(state: OdometryState) -> FloatArray:
-    """Pose of base_link in odom, shape (4, 4): in space where it is known so, else in the plane."""
-    if state.T_odom_base is not None:
-        return state.T_odom_base
-    c, s = math.cos(state.yaw), math.sin(state.yaw)
-    return np.array([[c, -s, 0.0, state.x], [s, c, 0.0, state.y], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])

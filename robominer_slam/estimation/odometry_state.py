@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -38,6 +39,14 @@ class OdometryState:
     velocity_covariance: FloatArray
     T_odom_base: FloatArray | None = None
     pose_covariance: FloatArray | None = None
+
+
+def planar_pose(state: OdometryState) -> FloatArray:
+    """Pose of base_link in odom, shape (4, 4): in space where it is known so, else in the plane."""
+    if state.T_odom_base is not None:
+        return state.T_odom_base
+    c, s = math.cos(state.yaw), math.sin(state.yaw)
+    return np.array([[c, -s, 0.0, state.x], [s, c, 0.0, state.y], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
 
 class DeadReckoning(Protocol):
