@@ -15,7 +15,7 @@ import zenoh
 from zenoh import ext
 
 from robominer_slam.publishing.keys import encoding_of, qos_of
-from robominer_slam.publishing.matching import somebody_listens
+from robominer_slam.publishing.publishers import somebody_listens
 from robominer_slam.publishing.rmw_zenoh import RmwZenohLayout
 from robominer_slam.publishing.ros2dds import Ros2DdsLayout
 from robominer_slam.publishing.ros_topics import RosBridgeName, RosLayout, RosTopic

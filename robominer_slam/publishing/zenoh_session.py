@@ -14,7 +14,7 @@ from zenoh import ext
 from robominer_slam.publishing import asking
 from robominer_slam.publishing.bus_messages import Query, QueryError, QueryRefusedError, Received, Reply, parameters_of
 from robominer_slam.publishing.keys import Qos, encoding_of, qos_of, qos_of_query
-from robominer_slam.publishing.matching import somebody_listens
+from robominer_slam.publishing.publishers import Publisher, declare, somebody_listens
 from robominer_slam.publishing.ros_bridge import open_bridge
 from robominer_slam.publishing.senders import Peer, own_source, sender
 from robominer_slam.publishing.zenoh_settings import ZenohSettings, ZenohSetupError, open_session
@@ -32,11 +32,8 @@ __all__ = [
 
 log = logging.getLogger(__name__)
 
-#: Whoever keeps a cache says this often, if something was sent, up to where it has sent, s.
-MISS_HEARTBEAT_S = 1.0
 DEFAULT_TIMEOUT_S = 5.0
 
-_Publisher: TypeAlias = zenoh.Publisher | ext.AdvancedPublisher
 _Declared: TypeAlias = "zenoh.Subscriber[None] | ext.AdvancedSubscriber[None] | zenoh.Queryable[None]"
 
 
@@ -65,7 +62,7 @@ class ZenohBus:
         self._commanders = settings.commanders
         self._session = open_session(settings)
         self._lock = threading.Lock()
-        self._publishers: dict[str, _Publisher] = {}
+        self._publishers: dict[str, Publisher] = {}
         self._latched: dict[str, Reply] = {}
         self._declared: list[_Declared] = []
         self._ros = open_bridge(self._session, settings.ros, self.prefix)
@@ -267,32 +264,13 @@ class ZenohBus:
         peers = (Peer(str(link.zid), link.auth_identifier) for link in self._session.info.links())
         return [peer for peer in peers if peer.name is None or peer.name in self._commanders]
 
-    def _publisher(self, key: str, qos: Qos | None) -> _Publisher:
+    def _publisher(self, key: str, qos: Qos | None) -> Publisher:
         with self._lock:
             publisher = self._publishers.get(key)
             if publisher is None:
-                publisher = self._declare(key, qos_of(key) if qos is None else qos)
+                publisher = declare(self._session, self._full(key), qos_of(key) if qos is None else qos)
                 self._publishers[key] = publisher
             return publisher
-
-    def _declare(self, key: str, qos: Qos) -> _Publisher:
-        if qos.cache == 0:
-            return self._session.declare_publisher(
-                self._full(key),
-                priority=qos.priority,
-                congestion_control=qos.congestion,
-                express=qos.express,
-            )
-        return ext.declare_advanced_publisher(
-            self._session,
-            self._full(key),
-            priority=qos.priority,
-            congestion_control=qos.congestion,
-            express=qos.express,
-            cache=ext.CacheConfig(qos.cache),
-            sample_miss_detection=ext.MissDetectionConfig(sporadic_heartbeat=MISS_HEARTBEAT_S, heartbeat=None),
-            publisher_detection=True,
-        )
 
     def _full(self, key: str) -> str:
         return f"{self.prefix}/{key}"
