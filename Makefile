@@ -3,7 +3,11 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types bench fuzz soak remote-link recordings clean venv
+.PHONY: demo test lint types bench fuzz soak remote-link recordings deb board-test clean venv
+
+# Of the packages: make deb SUITES=bookworm ARCHITECTURES=armhf
+SUITES ?= bookworm trixie
+ARCHITECTURES ?= amd64 arm64 armhf
 .DEFAULT_GOAL := help
 
 help:
@@ -14,6 +18,8 @@ help:
 	@echo "make remote-link  robot and operator over 64 kbit/s with outages, as root, half an hour"
 	@echo "make fuzz    ten million bytes of noise and damage for each decoder"
 	@echo "make recordings   the five scenarios as recordings, some minutes"
+	@echo "make deb     Debian packages in dist/, a minute each"
+	@echo "make board-test   the package on an emulated board, as root, a quarter of an hour"
 
 $(VENV)/.sim: pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -55,6 +61,15 @@ fuzz: $(VENV)/.dev
 
 recordings: $(VENV)/.sim
 	$(BIN)/python -m benchmarks.make_recordings
+
+deb: $(VENV)/.sim
+	for suite in $(SUITES); do for architecture in $(ARCHITECTURES); do \
+	  packaging/build_deb.sh $(BIN)/python $$architecture $$suite dist || exit; done; done
+
+board-test: $(VENV)/.sim
+	test -e dist/robominer-slam_*+deb12_armhf.deb -a -e dist/robominer-slam_*+deb12_amd64.deb || \
+	  $(MAKE) deb SUITES=bookworm ARCHITECTURES="amd64 armhf"
+	benchmarks/board/board_test.sh $(BIN)/python
 
 clean:
 	rm -rf $(VENV) out build dist .mypy_cache .ruff_cache .pytest_cache

@@ -10,7 +10,7 @@ root=$(cd "$(dirname "$0")/.." && pwd)
 boot() { # inside the namespaces; $1: the robot's folder
   mount --make-rprivate /
   mount -t tmpfs tmpfs /mnt
-  for d in etc opt var; do
+  for d in etc opt var usr/bin; do
     mkdir -p /mnt/$d/upper /mnt/$d/work
     mount -t overlay overlay -o lowerdir=/$d,upperdir=/mnt/$d/upper,workdir=/mnt/$d/work /$d
   done
@@ -20,16 +20,16 @@ boot() { # inside the namespaces; $1: the robot's folder
   mount --bind /proc/sys /proc/sys
   mount -o remount,bind,ro /proc/sys
   # Python may lie in a home, which the service does not see.
-  mkdir -p /opt/python /opt/source /opt/packages /opt/robominer-slam/bin /etc/robominer-slam
+  mkdir -p /opt/python /opt/source /opt/packages /etc/robominer-slam
   mount --bind "$("$python" -c 'import sys; print(sys.base_prefix)')" /opt/python
   mount --bind "$("$python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')" /opt/packages
   mount --bind "$root" /opt/source
-  cat >/opt/robominer-slam/bin/robominer-slam <<'PROGRAM'
+  cat >/usr/bin/robominer-slam <<'PROGRAM'
 #!/bin/sh
 export LD_LIBRARY_PATH=/opt/python/lib PYTHONPATH=/opt/source:/opt/packages PYTHONDONTWRITEBYTECODE=1
 exec /opt/python/bin/python3 -c 'from robominer_slam.cli.main import main; main()' "$@"
 PROGRAM
-  chmod 755 /opt/robominer-slam/bin/robominer-slam
+  chmod 755 /usr/bin/robominer-slam
   cp "$1/calibration.json" /etc/robominer-slam/
   sed "s#^path = .*#path = \"/var/lib/robominer-slam/map.db\"#" "$1/config.toml" >/etc/robominer-slam/config.toml
   systemd-sysusers "$root/systemd/sysusers.d/robominer-slam.conf"

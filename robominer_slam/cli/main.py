@@ -56,6 +56,15 @@ COMMANDS = {
     "status": "robominer_slam.cli.status:status",
 }
 ENTRY_POINT_GROUP = "robominer_slam.commands"
+#: Modules that a robot need not have, by the extra that brings them.
+EXTRAS = {
+    "cryptography": "keys",
+    "foxglove": "operator",
+    "magpylib": "sim",
+    "matplotlib": "operator",
+    "mujoco": "sim",
+    "nicegui": "operator",
+}
 
 
 class _Commands(click.Group):
@@ -101,6 +110,13 @@ def main() -> None:
         sys.exit(error.exit_code)
     except click.Abort:
         sys.exit(130)
+    except ModuleNotFoundError as error:
+        extra = EXTRAS.get((error.name or "").split(".")[0])
+        if extra is None:
+            raise
+        needs = f"{error.name}, which is not installed: pip install 'robominer-slam[{extra}]'"
+        click.echo(f"error: this needs {needs}", err=True)
+        sys.exit(2)
     except USER_ERRORS as error:
         # In the journal a line's level is a prefix; there is no log yet.
         prefix = "<3>" if stderr_is_journal() else ""

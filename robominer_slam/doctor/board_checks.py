@@ -57,7 +57,7 @@ def disk(store: Path) -> Finding:
         return Finding("disk", "error", f"{text}: the map cannot be kept for long", mend)
     if free_MB < LITTLE_DISK_MB:
         return Finding("disk", "warning", text, mend)
-    # The service's own user is made when it starts, with its folder: who looks may be another.
+    # The folder is the service's own user's: who looks may be another.
     if folder == store.parent and not os.access(folder, os.W_OK):
         return Finding("disk", "warning", f"{text}, but you may not write there", f"sudo chown $USER {folder}")
     return Finding("disk", "ok", text)
