@@ -117,6 +117,11 @@ def test_the_packaged_configuration_is_one_that_doctor_is_not_content_with_yet(t
     assert found["configuration"].level == "ok"
     assert found["device whiskers"].level == "error"
     assert found["calibration"].level == "error"
+    # As the maintainer script asks.
+    program = "from robominer_slam.cli.main import main; main()"
+    arguments = [sys.executable, "-c", program, "doctor", "--config", str(path)]
+    done = subprocess.run(arguments, capture_output=True, check=False, timeout=60, env={"PYTHONPATH": str(ROOT)})
+    assert done.returncode == 1
 
 
 def test_the_manual_page_has_every_command():

@@ -102,9 +102,8 @@ def cli(verbose: int) -> None:
 def main() -> None:
     """Entry point of the program."""
     try:
-        cli.main(standalone_mode=False)
-    except click.exceptions.Exit as done:
-        sys.exit(done.exit_code)
+        # Where it does not end the program itself, click gives back what a command exits with.
+        status = cli.main(standalone_mode=False)
     except click.ClickException as error:
         error.show()
         sys.exit(error.exit_code)
@@ -123,3 +122,5 @@ def main() -> None:
         for line in str(error).splitlines():
             click.echo(f"{prefix}error: {line}", err=True)
         sys.exit(2)
+    if status:
+        sys.exit(status)
