@@ -14,9 +14,9 @@ case $suite in
   *) echo "error: $suite: expected bookworm or trixie" >&2; exit 2 ;;
 esac
 case $arch in
-  amd64) machine=x86_64 ;;
-  arm64) machine=aarch64 ;;
-  armhf) machine=armv7l ;;
+  amd64) machine=x86_64 tools=x86_64-linux-gnu ;;
+  arm64) machine=aarch64 tools=aarch64-linux-gnu ;;
+  armhf) machine=armv7l tools=arm-linux-gnueabihf ;;
   *) echo "error: $arch: expected amd64, arm64 or armhf" >&2; exit 2 ;;
 esac
 SOURCE_DATE_EPOCH=${SOURCE_DATE_EPOCH:-$(git -C "$root" log -1 --format=%ct)}
@@ -30,10 +30,7 @@ tree=$work/tree library=$work/tree/usr/lib/robominer-slam
 install -d "$library" "$tree"/usr/{bin,lib/sysusers.d,lib/udev/rules.d,lib/modules-load.d,lib/systemd/system} \
   "$tree/etc/robominer-slam"
 
-if [[ $arch == armhf ]]; then
-  version=$(sed -n 's/^small-gicp==\([^ ]*\).*/\1/p' "$here/carried.txt")
-  "$here/small_gicp.sh" "$python" "$version" "$suite" "$target" "$wheels"
-fi
+"$here/compiled_wheels.sh" "$python" "$arch" $tools "$suite" "$target" "$wheels"
 rm -f "$wheels"/robominer_slam-*.whl
 "$python" -m pip wheel --quiet --no-deps -w "$wheels" "$root"
 # Debian 12 has glibc 2.36: wheels for any up to that.
@@ -45,6 +42,11 @@ done
   --implementation cp --python-version "$target" --abi "cp${target/./}" --abi abi3 --abi none "${platforms[@]}" \
   -r "$here/carried.txt" robominer-slam
 rm -rf "$library/bin" "$library"/*.dist-info/{INSTALLER,REQUESTED,RECORD,direct_url.json,uv_build.json}
+
+# Zenoh's comes with its symbols, a third of it.
+if command -v $tools-strip >/dev/null; then
+  find "$library" -name '*.so' -exec $tools-strip --strip-unneeded {} +
+fi
 
 install -m 755 "$here/robominer-slam" "$tree/usr/bin/"
 install -m 644 "$here/config.toml" "$tree/etc/robominer-slam/"
@@ -63,18 +65,17 @@ completion zsh usr/share/zsh/vendor-completions/_robominer-slam
 completion fish usr/share/fish/vendor_completions.d/robominer-slam.fish
 
 cp "$here"/debian/* "$work/debian/"
-mkdir "$work/docs"
-cp "$root"/docs/*.md "$root/README.md" "$work/docs/"
+mkdir "$work/documentation"
+cp "$root"/docs/*.md "$root"/{README,CHANGELOG}.md "$work/documentation/"
 PYTHONPATH=$root "$python" "$here/man_page.py" >"$work/debian/robominer-slam.1"
 number=$("$python" -c "import tomllib; print(tomllib.load(open('$root/pyproject.toml', 'rb'))['project']['version'])")
 cat >"$work/debian/changelog" <<CHANGELOG
 robominer-slam ($number+deb$debian) $suite; urgency=medium
 
-  * Release $number; see /usr/share/doc/robominer-slam/changelog.gz.
+  * Release $number; see /usr/share/doc/robominer-slam/CHANGELOG.md.gz.
 
  -- The robominer-slam authors <robominer-slam@localhost>  $(date -u -R -d "@$SOURCE_DATE_EPOCH")
 CHANGELOG
-cp "$root/CHANGELOG.md" "$work/CHANGELOG"
 
 cd "$work"
 PYTHON_DEPENDS="python3 (>= $target), python3 (<< $next)" dpkg-buildpackage --build=binary --no-sign --no-check-builddeps \

@@ -29,7 +29,6 @@ DEBIAN = {
 }
 #: Named by what is carried, and not needed for what is used of it; `carried.txt` says why.
 NOT_NEEDED = {
-    "filterpy": {"matplotlib"},
     "python-dateutil": {"tzdata"},
     "rosbags": {"apsw", "backports-zstd", "ruamel-yaml"},
     "sqlite-utils": {"pip"},

@@ -54,6 +54,7 @@ replay() { # root
 
 simulated_robot() { # its devices on this machine's pseudo-terminals, its configuration on the board
   local etc=$BOARD/$1/etc/robominer-slam link port
+  rm -rf "$work/robot" "$work/robot.log"
   "$python" -c 'from robominer_slam.cli.main import main; main()' simulate --from "$recordings/scenario-3.mcap" --out "$work/robot" --listen $endpoint \
     --wait 600 --json >"$work/robot.log" 2>&1 &
   started+=($!)
@@ -62,7 +63,7 @@ simulated_robot() { # its devices on this machine's pseudo-terminals, its config
   sed 's#^path = .*#path = "/var/lib/robominer-slam/map.db"#' "$work/robot/config.toml" >"$etc/config.toml"
   for link in "$work"/robot/dev/*; do
     port=$(readlink -f "$link")
-    sed -i "s#\"dev/${link##*/}\"#\"$port\"#" "$etc/config.toml"
+    sed -i "s#\"$link\"#\"$port\"#" "$etc/config.toml"
     on_root "$1" chgrp robominer-devices "$port"
     chmod 660 "$port"
   done
