@@ -69,7 +69,7 @@ deb: $(VENV)/.sim
 board-test: $(VENV)/.sim
 	test -e dist/robominer-slam_*+deb12_armhf.deb -a -e dist/robominer-slam_*+deb12_amd64.deb || \
 	  $(MAKE) deb SUITES=bookworm ARCHITECTURES="amd64 armhf"
-	benchmarks/board/board_test.sh $(BIN)/python
+	benchmarks/board/board_test.sh $(BIN)/python $(STEPS)
 
 clean:
 	rm -rf $(VENV) out build dist .mypy_cache .ruff_cache .pytest_cache

@@ -57,6 +57,8 @@ from sim_backend.framed_encoder import PING, CommandDecoder, FramedEncoder
 #: The devices' clocks are learned before the drive, as the daemon does while it waits for frames.
 LEARNING_NS = 1_000_000_000
 SENSOR_PERIOD_US = 300
+#: Not the daemon's own, which may be running.
+ENDPOINT = "tcp/127.0.0.1:17949"
 #: A board that has measured sends within a millisecond.
 ARRIVAL_NS = 1_000_000
 
@@ -198,7 +200,8 @@ def main() -> None:
         prefix = f"robominer/{configuration.robot.id}"
         store = MapStore(Path(folder) / "map.db", configuration.store.sync_s, configuration.robot.id, "")
         supervision = Supervision(Notifier(), Reload(path, configuration))
-        with ZenohBus(robot_settings(configuration.zenoh, Path(folder), prefix), prefix) as bus, store:
+        section = configuration.zenoh.model_copy(update={"listen": (ENDPOINT,)})
+        with ZenohBus(robot_settings(section, Path(folder), prefix), prefix) as bus, store:
             array = CalibratedArray(inputs.layout, inputs.model)
             running = daemon.Daemon(configuration, array, source, bus, store, supervision)
             stages.begin("main loop")

@@ -39,10 +39,14 @@ fresh_root() { # name, architecture: a copy of the bare root, ready to be used
   unmount_root "$1"
   rm -rf --one-file-system "$root"
   cp -a "$BOARD/bare-$SUITE-$2" "$root"
-  mount -t proc proc "$root/proc"
-  mount --bind /dev "$root/dev"
-  mount --bind /dev/pts "$root/dev/pts"
+  mount_root "$1"
   cp -L /etc/resolv.conf "$root/etc/"
+}
+
+mount_root() {
+  mountpoint -q "$BOARD/$1/proc" || mount -t proc proc "$BOARD/$1/proc"
+  mountpoint -q "$BOARD/$1/dev" || mount --bind /dev "$BOARD/$1/dev"
+  mountpoint -q "$BOARD/$1/dev/pts" || mount --bind /dev/pts "$BOARD/$1/dev/pts"
 }
 
 # A clean environment. One thread of OpenBLAS, as on a board that has other things to do with its second core.
