@@ -60,13 +60,14 @@ class Change:
         row: the map that it belongs to.
         keyframes: new ones, with their poses in map.
         edges: new ones.
-        removed, merged, bare: as in `BackendResult`.
+        dropped, removed, merged, bare: as in `BackendResult`.
         clock_offset_ns: added to stamps.
     """
 
     row: MapRow
     keyframes: Sequence[tuple[Keyframe, FloatArray]]
     edges: Sequence[GraphEdge]
+    dropped: Sequence[tuple[int, int]]
     removed: Sequence[int]
     merged: Sequence[Merge]
     bare: Sequence[int]
@@ -77,7 +78,7 @@ class Change:
         """What is to be stored of a result."""
         place = {k: n for n, k in enumerate(result.keyframe_ids)} if result.new_keyframes else {}
         keyframes = [(k, result.poses[place[k.id]].copy()) for k in result.new_keyframes]
-        return cls(row, keyframes, edges, result.removed, result.merged, result.bare, clock_offset_ns)
+        return cls(row, keyframes, edges, result.dropped, result.removed, result.merged, result.bare, clock_offset_ns)
 
     def without_keyframes(self) -> Change:
         """What is left of it when its keyframes are lost."""
@@ -106,6 +107,8 @@ class Change:
         many("DELETE FROM edges WHERE map_id = ? AND j = ?", gone)
         many("DELETE FROM edges WHERE map_id = ? AND i = ?", gone)
         many("DELETE FROM keyframes WHERE map_id = ? AND id = ?", gone)
+        many("DELETE FROM edges WHERE map_id = ? AND kind = 'loop' AND i = ? AND j = ?",
+             [(map_id, i, j) for i, j in self.dropped])  # fmt: skip
         edges = [edge_row(map_id, edge) for edge in self.edges]
         many("INSERT INTO edges VALUES (?, ?, ?, ?, ?, ?, ?)", edges)
 

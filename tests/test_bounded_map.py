@@ -24,9 +24,8 @@ from robominer_slam.slam.closure_search import Patch
 from robominer_slam.slam.covered_ground import covered_share
 from robominer_slam.slam.graph_marginals import TrackedCovariance
 from robominer_slam.slam.keyframe_graph import KeyframeGraph
-from robominer_slam.slam.keyframe_removal import composed, mergeable, remove_keyframes
+from robominer_slam.slam.keyframe_removal import mergeable, remove_keyframes
 from robominer_slam.slam.level_edges import LevelEdge
-from robominer_slam.slam.loop_transfer import move_loops
 from robominer_slam.slam.patch_memory import PatchMemory
 from robominer_slam.slam.robust import RobustBackend
 
@@ -65,33 +64,6 @@ def circling(count: int, seed: int = 0, off: float = 0.001) -> KeyframeGraph:
     return graph
 
 
-def test_a_composed_edge_says_what_the_chain_says():
-    rng = np.random.default_rng(3)
-    first, second = odometry(rng, 0, 1), odometry(rng, 1, 2)
-    one = composed(first, second, np.array([2e-3, -1e-3, 5e-4]))
-    for bias in (np.zeros(3), np.array([2e-3, -1e-3, 5e-4]), np.array([3e-3, 1e-3, 0.0])):
-        parts = [
-            geometry.se2_compose(e.Z, geometry.se2_exp(e.jacobian @ (bias - e.reference))) for e in (first, second)
-        ]
-        whole = geometry.se2_compose(one.Z, geometry.se2_exp(one.jacobian @ (bias - one.reference)))
-        np.testing.assert_allclose(whole, geometry.se2_compose(*parts), atol=2e-5)
-    samples = 40_000
-    noise = [
-        geometry.se2_exp(rng.multivariate_normal(np.zeros(3), np.linalg.inv(e.information), samples))
-        for e in (first, second)
-    ]
-    bias = one.reference
-    ends = geometry.se2_compose(
-        geometry.se2_compose(geometry.se2_compose(parts_at(first, bias), noise[0]), parts_at(second, bias)), noise[1]
-    )
-    errors = geometry.se2_log(geometry.se2_compose(geometry.se2_inverse(one.Z), ends))
-    expected = np.linalg.inv(one.information)
-    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-    assert np.abs(np.cov(errors.T) - expected).max() <= 0.05 * scale.max()
-    assert (one.i, one.j, one.dz) == (0, 2, pytest.approx(0.002))
-    assert 1.0 / one.dz_information == pytest.approx(2e-5)
-
-
 def parts_at(edge: LevelEdge, bias: np.ndarray) -> np.ndarray:
     return geometry.se2_compose(edge.Z, geometry.se2_exp(edge.jacobian @ (bias - edge.reference)))
 
@@ -121,36 +93,6 @@ def test_a_keyframe_without_closures_leaves_without_a_trace():
     graph.optimise()
     np.testing.assert_allclose(graph.nodes[159], pose, atol=2e-5)
     np.testing.assert_allclose(graph.covariance([159]), covariance, rtol=0.01, atol=1e-9)
-
-
-def test_the_map_keeps_the_shape_that_dropped_closures_gave_it():
-    graph = circling(160, off=0.003)
-    keys = [k for k in set(graph.edges.j[graph.edges.loop].tolist()) if k > 100]
-    before = {k: graph.relative(k - 1, k + 1) for k in keys}
-    bridges = remove_keyframes(graph, keys)
-    assert sorted(bridge.i + 1 for bridge in bridges) == sorted(keys)
-    for bridge in bridges:
-        np.testing.assert_allclose(bridge.Z, before[bridge.i + 1], atol=1e-12)
-
-
-def test_moved_closures_say_no_more_than_they_did():
-    """And nearly as much: the odometry edge that they move along is short."""
-    graph = circling(160, off=0.002)
-    stay = [30, 61, 103, 159]
-    before = [graph.covariance([k]) for k in stay]
-    poses = [graph.nodes[k] for k in stay]
-    keys = [*range(68, 150, 8), 5]
-    for key in keys:
-        move_loops(graph, key, key - 1)
-    assert (graph.edges.loop & np.isin(graph.edges.j, [k - 1 for k in keys])).sum() == len(keys) - 1
-    assert not (graph.edges.loop & np.isin(graph.edges.j, keys)).any()
-    remove_keyframes(graph, keys)
-    graph.optimise()
-    for k, old, pose in zip(stay, before, poses, strict=True):
-        new = graph.covariance([k])
-        assert np.linalg.eigvalsh(new - old)[0] >= -1e-3 * np.trace(old)
-        assert np.trace(new) < 1.5 * np.trace(old)
-        np.testing.assert_allclose(graph.nodes[k], pose, atol=0.004)
 
 
 def test_the_first_and_the_last_keyframe_cannot_leave():
@@ -299,8 +241,15 @@ def test_removed_keyframes_vanish_from_map_graph_and_stream():
     encoder, decoder = MapStreamEncoder(7), MapStreamDecoder()
     removed: set[int] = set()
     bare: set[int] = set()
+    again: set[int] = set()
+    walls = set(range(60, 180, 7))
     for keyframe, _ in rounds(180):
+        if keyframe.id in walls:
+            floor = np.ones(len(keyframe.points), dtype=np.bool_)
+            floor[0] = False
+            keyframe = replace(keyframe, floor=floor)
         result = backend.process(keyframe)
+        again |= {key for key in result.bare if key < keyframe.id - 40}
         whole.take(result)
         removed |= set(result.removed)
         bare |= set(result.bare)
@@ -309,6 +258,9 @@ def test_removed_keyframes_vanish_from_map_graph_and_stream():
             decoder.feed(message)
     assert len(removed) > 80
     assert bare
+    # In a full map later passes cover what was kept at first; touches of walls nothing covers.
+    assert again
+    assert not bare & walls
     ids = [k.id for k in whole.keyframes]
     assert not set(ids) & removed
     assert ids == sorted(ids)

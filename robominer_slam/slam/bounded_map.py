@@ -1,8 +1,9 @@
 """Keeps the map of the method `robust` within its bounds: which touches are kept, and which keyframes.
 
-Touches on ground that the map has already are not kept, once closures have tied their keyframe to it. When keyframes
-are too many, those without touches go first (from the inside of covered stretches, oldest first); then neighbours far
-from the robot are merged, the touches of one moved into the other's frame; at last the farthest are forgotten.
+Touches on ground that the map has already are not kept, once closures have tied their keyframe to it; in a full map
+they are judged again wherever the robot comes. When keyframes are too many, those without touches go first (from the
+inside of covered stretches, oldest first); then neighbours far from the robot are merged, the touches of one moved into
+the other's frame; at last the farthest are forgotten. When closures are too many, those that say least go.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from robominer_slam import geometry
 from robominer_slam.configuration.bounded_map_section import BoundedMapSection
+from robominer_slam.slam.closure_leverage import drop_least_needed
 from robominer_slam.slam.closure_search import Patch
 from robominer_slam.slam.composite_scan import voxel_filter
 from robominer_slam.slam.covered_ground import covered_share
@@ -26,7 +28,6 @@ from robominer_slam.slam.keyframe_removal import (
     mergeable,
     remove_keyframes,
 )
-from robominer_slam.slam.loop_transfer import move_loops
 from robominer_slam.slam.patch_memory import PatchMemory
 from robominer_slam.slam.surface_registration import placed
 
@@ -36,6 +37,10 @@ FloatArray = NDArray[np.float64]
 BATCH = 16
 #: Keyframes whose touches are judged at one keyframe at most: those of a small map wait until it is large.
 DECISIONS = 2
+#: Where closures are too many, this part of those that may be there goes with them: leverages are computed seldom.
+CLOSURE_BATCH = 16
+#: In a full map touches this near the robot are judged again, m: they are in memory, and the map is surest there.
+AGAIN = 1.5
 #: Ground is looked for among keyframes this much farther than the touches reach, m: as far as others' touches reach.
 GROUND_REACH = 0.6
 
@@ -60,6 +65,7 @@ class BoundedMap:
         self._patches = patches
         self._undecided: deque[int] = deque()
         self._spans: dict[int, float] = {}
+        self._judged: dict[int, int] = {}
         self.removed: list[int] = []
         self.merged: list[Merge] = []
         self.bare: list[int] = []
@@ -98,16 +104,34 @@ class BoundedMap:
         nodes = self._graph.nodes
         if len(nodes) <= self._bounds.small_map:
             return
+        if len(nodes) > self._bounds.max_keyframes - BATCH:
+            self._judge_again(newest, min_travel)
         for _ in range(min(DECISIONS, len(self._undecided))):
             key = self._undecided[0]
             row = nodes.row(key)
             if newest - key <= partner_span or nodes.travelled[-1] - nodes.travelled[row] < patch:
                 return
             self._undecided.popleft()
-            if self._closed(key) and self._covered(row, min_travel):
-                nodes.mapped[row] = False
-                self._patches.pop(key)
-                self.bare.append(key)
+            self._judge(key, newest, min_travel)
+
+    def _judge_again(self, newest: int, min_travel: float) -> None:
+        """Judge one of the keyframes near the robot again, the one judged longest ago: later passes may cover it."""
+        nodes = self._graph.nodes
+        near = nodes.mapped & (nodes.travelled <= nodes.travelled[-1] - min_travel)
+        near &= np.hypot(*(nodes.poses[:, :2] - nodes.poses[-1, :2]).T) <= AGAIN
+        keys = [k for k in nodes.ids[near].tolist() if k in self._judged]
+        if keys:
+            key = min(keys, key=lambda k: (self._judged[k], k))
+            self._judge(key, newest, min_travel)
+
+    def _judge(self, key: int, newest: int, min_travel: float) -> None:
+        """Drop the touches of a keyframe if closures hold it and others cover it."""
+        self._judged[key] = newest
+        if self._closed(key) and self._covered(self._graph.nodes.row(key), min_travel):
+            self._graph.nodes.mapped[self._graph.nodes.row(key)] = False
+            self._patches.pop(key)
+            self._judged.pop(key)
+            self.bare.append(key)
 
     def shrink(self) -> bool:
         """Let keyframes go where they are too many; True if any went."""
@@ -127,20 +151,29 @@ class BoundedMap:
             self._remove(merged)
         self._remove(covered(graph, window)[: len(graph.nodes) - target])
         self._remove(farthest(graph, window, robot)[: len(graph.nodes) - target])
+        excess = int(graph.edges.loop.sum()) - bounds.max_closures
+        if excess > 0:
+            drop_least_needed(graph, excess + bounds.max_closures // CLOSURE_BATCH, window)
         return True
 
     def _closed(self, key: int) -> bool:
-        edges = self._graph.edges
-        return bool(len(edges) and (edges.loop & edges.enabled & (edges.j == key)).any())
+        """Whether a closure holds a keyframe, or one so near that odometry is as sure as closures are."""
+        edges, span = self._graph.edges, self._bounds.sure_span
+        if not len(edges):
+            return False
+        near = (np.abs(edges.i - key) <= span) | (np.abs(edges.j - key) <= span)
+        return bool((edges.loop & edges.enabled & near).any())
 
     def _covered(self, row: int, min_travel: float) -> bool:
+        """Whether the touches of a keyframe lie on ground that other passes have touched."""
         nodes = self._graph.nodes
         own = self._placed(int(nodes.ids[row]))
         if not len(own):
             return True
         xy = nodes.poses[row, :2]
         reach = float(np.hypot(*(own[:, :2] - xy).T).max()) + GROUND_REACH
-        near = nodes.mapped & (nodes.travelled <= nodes.travelled[row] - min_travel)
+        near = nodes.mapped & (np.abs(nodes.travelled - nodes.travelled[row]) >= min_travel)
+        near &= nodes.travelled <= nodes.travelled[-1] - min_travel
         near &= np.hypot(*(nodes.poses[:, :2] - xy).T) <= reach
         if not near.any():
             return False
@@ -156,7 +189,6 @@ class BoundedMap:
         row = nodes.row(key)
         before = int(nodes.ids[row - 1])
         shift = np.append(self._graph.relative(before, key), nodes.heights[row] - nodes.heights[row - 1])
-        move_loops(self._graph, key, before)
         points = np.concatenate([self._patches[before].points, placed(self._patches[key].points, shift)])
         points = voxel_filter(points, self._bounds.merge_voxel)
         self._patches[before] = Patch(points, float(nodes.travelled[row - 1]))
@@ -167,6 +199,9 @@ class BoundedMap:
         self.merged.append(Merge(key, before, R_into.T @ T @ R_gone, self._bounds.merge_voxel))
         step = float(nodes.travelled[row] - nodes.travelled[row - 1])
         self._spans[before] = step + self._spans.get(key, 0.0)
+        if key not in self._judged:
+            # Its touches may be of walls, which nothing covers: the keyframe that gets them keeps its own, too.
+            self._judged.pop(before, None)
 
     def _remove(self, keys: list[int]) -> None:
         if not keys:
@@ -175,6 +210,7 @@ class BoundedMap:
         for key in keys:
             self._patches.pop(key)
             self._spans.pop(key, None)
+            self._judged.pop(key, None)
         gone = set(keys)
         self._undecided = deque(key for key in self._undecided if key not in gone)
         self.removed += keys

@@ -101,6 +101,8 @@ class BackendResult:
         ids: of the keyframes that `poses` are of; None for 0, 1, 2, ...
         localised: whether the keyframe's place in the map is known.
         added: edges that were not in the result before; None where the back-end does not say.
+        dropped: pairs (i, j) of keyframes whose loop closures have left the graph though both stay; `added` may have
+            one that takes their place.
         removed: ids of keyframes that have left the graph with all their edges.
         merged: which of these hand their touches to a neighbour, in order.
         bare: ids of keyframes that keep no touches: the map has their ground from others.
@@ -118,6 +120,7 @@ class BackendResult:
     ids: tuple[int, ...] | None = None
     localised: bool = True
     added: Sequence[GraphEdge] | None = None
+    dropped: Sequence[tuple[int, int]] = ()
     removed: Sequence[int] = ()
     merged: Sequence[Merge] = ()
     bare: Sequence[int] = ()

@@ -54,7 +54,7 @@ class KeyframeGraph:
         """Move all keyframes and the biases to the least squared error; the first keyframe stays."""
         if len(self.nodes) < 2:
             return
-        problem, system, kernels = self._problem()
+        problem, system, kernels = self.problem()
         found = pose_graph_bias.solve(problem, kernels, self.nodes.poses.copy(), self.bias, system)
         self.nodes.poses[:] = found.poses
         self.bias = found.bias
@@ -74,7 +74,7 @@ class KeyframeGraph:
         problem = BiasProblem(
             i.astype(np.int64),
             j.astype(np.int64),
-            self._measured(rows),
+            self.measured(rows),
             edges.information[rows],
             np.zeros((len(rows), 3, 0)),
             np.zeros((len(rows), 0)),
@@ -96,7 +96,7 @@ class KeyframeGraph:
         poses = self.nodes.poses
         i, j, rows = self._ends(np.ones(len(edges), dtype=np.bool_))
         relative = geometry.se2_compose(geometry.se2_inverse(poses[i]), poses[j])
-        error = geometry.se2_log(geometry.se2_compose(geometry.se2_inverse(self._measured(rows)), relative))
+        error = geometry.se2_log(geometry.se2_compose(geometry.se2_inverse(self.measured(rows)), relative))
         edges.chi2[:] = np.einsum("mi,mij,mj->m", error, edges.information, error)
 
     def relative(self, i: int, j: int) -> FloatArray:
@@ -113,7 +113,7 @@ class KeyframeGraph:
 
     def marginals(self) -> GraphMarginals:
         """Covariances at the present poses, by one factorisation."""
-        problem, system, kernels = self._problem()
+        problem, system, kernels = self.problem()
         return GraphMarginals(problem, kernels, self.nodes.poses.copy(), self.bias, system)
 
     def covariance(self, nodes: list[int]) -> FloatArray:
@@ -128,7 +128,7 @@ class KeyframeGraph:
         steps = ~edges.loop & (edges.j > min(a, b)) & (edges.j <= max(a, b))
         return np.asarray(np.add.reduce(edges.covariance[steps], axis=0))
 
-    def _measured(self, rows: IndexArray) -> FloatArray:
+    def measured(self, rows: IndexArray) -> FloatArray:
         """Edges' Z at the present biases, shape (m, 3)."""
         edges = self.edges
         twist = (edges.jacobian[rows] @ (self.bias - edges.reference[rows])[:, :, None])[:, :, 0]
@@ -139,7 +139,8 @@ class KeyframeGraph:
         rows = np.flatnonzero(chosen)
         return self.nodes.rows(self.edges.i[rows]), self.nodes.rows(self.edges.j[rows]), rows
 
-    def _problem(self) -> tuple[BiasProblem, SystemPattern, Kernels]:
+    def problem(self) -> tuple[BiasProblem, SystemPattern, Kernels]:
+        """The edges that count as least squares over poses and biases, by places of nodes; all without kernels."""
         edges = self.edges
         i, j, rows = self._ends(edges.enabled)
         problem = BiasProblem(

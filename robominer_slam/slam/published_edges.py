@@ -23,22 +23,26 @@ class PublishedEdges:
     Attributes:
         edges: all of them, in the graph's order.
         added: those that the last `follow` found new.
+        dropped: pairs of keyframes, both still there, whose closures the last `follow` missed.
     """
 
     def __init__(self) -> None:
         self.edges: list[GraphEdge] = []
         self.added: list[GraphEdge] = []
+        self.dropped: list[tuple[int, int]] = []
         self._serials = np.zeros(0, dtype=np.int64)
         self._enabled = np.zeros(0, dtype=np.bool_)
 
     def follow(self, edges: LevelEdges, nodes: KeyframeNodes) -> None:
         """Take the graph as it is now."""
-        self.added = []
+        self.added, self.dropped = [], []
         if not len(edges):
             return
         serials, enabled = edges.serial, edges.enabled
         if not np.array_equal(serials[: len(self._serials)], self._serials):
             stays = np.isin(self._serials, serials)
+            ends = (self.edges[k] for k in np.flatnonzero(~stays))
+            self.dropped = [(edge.i, edge.j) for edge in ends if edge.i in nodes and edge.j in nodes]
             self.edges = [self.edges[k] for k in np.flatnonzero(stays)]
             self._enabled = self._enabled[stays]
         known = len(self.edges)

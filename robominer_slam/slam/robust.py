@@ -368,6 +368,7 @@ class RobustBackend:
             version=self._version,
             ids=tuple(nodes.ids.tolist()),
             added=tuple(self._published.added),
+            dropped=tuple(self._published.dropped),
             removed=tuple(self._map.removed),
             merged=tuple(self._map.merged),
             bare=tuple(self._map.bare),
