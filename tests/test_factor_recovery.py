@@ -161,6 +161,16 @@ def test_two_closures_between_the_same_keyframes_become_one():
     np.testing.assert_allclose(one.covariance([12]), both.covariance([12]), rtol=1e-3, atol=1e-12)
 
 
+def test_no_closure_becomes_surer_than_touches_are():
+    graph = straight(20, [(1, 12)])
+    many = graph.edges.edge(int(np.flatnonzero(graph.edges.loop)[0]))
+    for _ in range(100):
+        many = combined(graph, many, loop(graph, 1, 12, 0.0))
+    assert np.linalg.eigvalsh(many.information)[-1] == pytest.approx(1e6)
+    few = combined(graph, loop(graph, 1, 12, 0.0), loop(graph, 1, 12, 0.0))
+    np.testing.assert_allclose(few.information, 2e5 * np.eye(3))
+
+
 def test_a_recovered_closure_joins_the_one_that_is_there():
     graph = straight(30, [(2, 4), (2, 12), (4, 14)])
     remove_keyframes(graph, list(range(8, 25)))

@@ -44,10 +44,6 @@ class BoundedMapSection(Section):
     max_keyframes: int = parameter(
         1000, "1", "of the graph: solving all of it takes 25 ms, on the board 0.6 s", low=50, high=1_000_000
     )
-    max_closures: int = parameter(
-        1000, "1", "of the graph, one per keyframe: beyond, those that say least go; thrice as many double the time",
-        low=50, high=1_000_000,
-    )  # fmt: skip
     tie_spacing: int = parameter(
         4, "1", "of so many keyframes without touches one stays as long as others can go: its closures hold the map",
         low=2, high=1000,

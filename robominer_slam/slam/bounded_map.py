@@ -37,7 +37,7 @@ FloatArray = NDArray[np.float64]
 BATCH = 16
 #: Keyframes whose touches are judged at one keyframe at most: those of a small map wait until it is large.
 DECISIONS = 2
-#: Where closures are too many, this part of those that may be there goes with them: leverages are computed seldom.
+#: Where closures are more than keyframes may be, this part of them goes, too: leverages are computed seldom.
 CLOSURE_BATCH = 16
 #: In a full map touches this near the robot are judged again, m: they are in memory, and the map is surest there.
 AGAIN = 1.5
@@ -151,9 +151,9 @@ class BoundedMap:
             self._remove(merged)
         self._remove(covered(graph, window)[: len(graph.nodes) - target])
         self._remove(farthest(graph, window, robot)[: len(graph.nodes) - target])
-        excess = int(graph.edges.loop.sum()) - bounds.max_closures
+        excess = int(graph.edges.loop.sum()) - bounds.max_keyframes
         if excess > 0:
-            drop_least_needed(graph, excess + bounds.max_closures // CLOSURE_BATCH, window)
+            drop_least_needed(graph, excess + bounds.max_keyframes // CLOSURE_BATCH, window)
         return True
 
     def _closed(self, key: int) -> bool:

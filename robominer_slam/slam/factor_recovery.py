@@ -39,6 +39,8 @@ IndexArray = NDArray[np.int64]
 JOINED = 6.0 * float(np.log(2.0))
 #: Edges that say less are as good as none, and only keep the odometry a chain: sigmas of x, y (m) and heading (rad).
 LOOSE = np.array([3.0, 3.0, 1.0])
+#: No closure is surer, m, m and rad, however many it stands for: each keyframe's touches have errors of their own.
+SUREST = np.array([0.001, 0.001, 0.001])
 #: Edges that want a pose so far from where it lies, m and rad, know nothing of it: it is left where it lies.
 KNOWN = 0.1
 
@@ -82,7 +84,7 @@ def combined(graph: KeyframeGraph, one: LevelEdge, other: LevelEdge) -> LevelEdg
         one.i,
         one.j,
         geometry.se2_compose(now, geometry.se2_exp(moved)),
-        information,
+        _no_surer(information),
         (one.dz * one.dz_information + other.dz * other.dz_information) / dz_information,
         dz_information,
         jacobian,
@@ -182,6 +184,14 @@ class _Marginal:
         edges, nodes = self._graph.edges, self._graph.nodes
         names = edges.i * (nodes.ids[-1] + 1) + edges.j
         return np.isin(self._ids[p] * (nodes.ids[-1] + 1) + self._ids[q], names[edges.loop & edges.enabled])
+
+
+def _no_surer(information: FloatArray) -> FloatArray:
+    """Information, shape (3, 3), that in no direction says more than `SUREST`."""
+    values, vectors = np.linalg.eigh(SUREST[:, None] * information * SUREST)
+    if values[-1] <= 1.0:
+        return information
+    return np.asarray((vectors * np.minimum(values, 1.0)) @ vectors.T) / np.outer(SUREST, SUREST)
 
 
 def _differences(p: IndexArray, q: IndexArray, n: int, relative: FloatArray) -> FloatArray:
