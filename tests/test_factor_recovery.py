@@ -202,3 +202,24 @@ def test_closures_that_tie_sessions_are_never_let_go():
     assert 1 <= graph.edges.loop.sum() < 8
     graph.optimise()
     np.testing.assert_allclose(graph.relative(5, 45), [0.0, 0.2, 0.0], atol=1e-6)
+
+
+def test_the_odometry_of_a_drive_without_end_never_becomes_too_loose_to_be_solved():
+    """One edge bridges all keyframes that went; its uncertainty is bounded, and so is what numbers have to bear."""
+    graph, first = straight(26, []), 12
+    step, information = geometry.se2_exp(np.array([0.25, 0.0, 0.05])), np.diag(STEP_SIGMA**-2)
+    for _ in range(60):
+        remove_keyframes(graph, graph.nodes.ids[first:-2].tolist())
+        for _ in range(first):
+            k = int(graph.nodes.ids[-1]) + 1
+            graph.edges.append(
+                LevelEdge("odometry", k - 1, k, step, information, 0.0, 1e5, -2.5 * np.eye(3), graph.bias)
+            )
+            graph.nodes.append(k, geometry.se2_compose(graph.nodes[k - 1], step), 0.0, np.eye(3), 0.25 * k)
+            graph.edges.append(loop(graph, k % (first - 1), k, 0.0))
+    bridge = int(np.flatnonzero(~graph.edges.loop & (graph.edges.i == first - 1))[0])
+    assert graph.edges.j[bridge] > 700
+    assert graph.edges.dz_information[bridge] >= 1.0
+    assert np.linalg.eigvalsh(graph.edges.covariance[bridge])[-1] <= 9.0
+    graph.optimise()
+    assert np.isfinite(graph.covariance([k])).all()

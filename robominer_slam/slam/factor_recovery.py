@@ -37,8 +37,10 @@ IndexArray = NDArray[np.int64]
 
 #: A pair that a closure joins already is taken before one of so much less log det Sigma: twice the sigma, three axes.
 JOINED = 6.0 * float(np.log(2.0))
-#: Edges that say less are as good as none, and only keep the odometry a chain: sigmas of x, y (m) and heading (rad).
+#: Edges that say less are as good as none, and only keep the odometry a chain: sigmas of x, y (m) and heading
+#: (rad), and of the height (m).
 LOOSE = np.array([3.0, 3.0, 1.0])
+LOOSE_HEIGHT = 1.0
 #: No closure is surer, m, m and rad, however many it stands for: each keyframe's touches have errors of their own.
 SUREST = np.array([0.001, 0.001, 0.001])
 #: Edges that want a pose so far from where it lies, m and rad, know nothing of it: it is left where it lies.
@@ -144,8 +146,8 @@ class _Marginal:
         dz = z[q] - z[p] - A_z[:, 0] @ (self._G_z @ self._r_z)
         jacobian = (gain @ edges.jacobian[rows]).sum(axis=1)
         slack = (gain @ edges.slack[rows] @ gain.transpose(0, 1, 3, 2)).sum(axis=1)
-        covariance = covariance * _excess(A, covariance, self._P, self._around, 3)
-        variance = variance * _excess(A_z, variance[:, None, None], self._P_z, self._around, 1)
+        covariance = covariance * _excess(A, covariance, self._P)
+        variance = variance * _excess(A_z, variance[:, None, None], self._P_z)
         fade = float(edges.fade[rows].min())
         return [
             LevelEdge(
@@ -155,7 +157,7 @@ class _Marginal:
                 Z[k],
                 _inverse(covariance[k]) + np.diag(LOOSE**-2.0),
                 float(dz[k]),
-                1.0 / float(variance[k]),
+                1.0 / float(variance[k]) + LOOSE_HEIGHT**-2.0,
                 jacobian[k],
                 graph.bias.copy(),
                 fade=fade,
@@ -241,14 +243,14 @@ def _spanning_tree(p: IndexArray, q: IndexArray, cost: FloatArray) -> IndexArray
     return np.array(chosen, dtype=np.int64)
 
 
-def _excess(A: FloatArray, covariance: FloatArray, P: FloatArray, around: IndexArray, d: int) -> float:
-    """Greatest ratio of the information of a tree, A and covariance (k, d, d), to that of the marginal; 1 or more."""
-    if len(A) < 2:
-        return 1.0
-    places = (around[1:, None] * d + np.arange(d)).ravel()
-    AL = A[:, :, places] @ np.linalg.cholesky(P[np.ix_(places, places)])
-    tree = (AL.transpose(0, 2, 1) @ np.linalg.solve(covariance, AL)).sum(axis=0)
-    return max(1.0, float(np.linalg.eigvalsh(tree)[-1]))
+def _excess(A: FloatArray, covariance: FloatArray, P: FloatArray) -> float:
+    """Greatest ratio of the information of a tree, A (k, d, n d) and covariance (k, d, d), to that of the marginal.
+
+    With W = diag(covariance)^-1/2 it is the greatest eigenvalue of W A P A' W': of how far the tree's edges correlate.
+    """
+    k, d, _ = A.shape
+    whitened = np.linalg.solve(np.linalg.cholesky(covariance), A).reshape(k * d, -1)
+    return max(1.0, float(np.linalg.eigvalsh(whitened @ P @ whitened.T)[-1]))
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:
