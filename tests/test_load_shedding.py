@@ -55,7 +55,7 @@ def endpoint() -> str:
 
 
 def test_a_daemon_that_is_held_up_says_so_and_recovers(tmp_path: Path, endpoint: str) -> None:
-    """Suspended for half of each second, as on a board that others keep busy; afterwards left alone."""
+    """Suspended for two thirds of the time, as on a board that others keep busy; afterwards left alone."""
     robot = subprocess.Popen(
         program("simulate", "--scenario", "0", "--engine", "quasi-static", "--out", str(tmp_path), "--json",
                 "--listen", endpoint),
@@ -66,7 +66,7 @@ def test_a_daemon_that_is_held_up_says_so_and_recovers(tmp_path: Path, endpoint:
         assert robot.stdout is not None
         assert json.loads(robot.stdout.readline())
         with (tmp_path / "config.toml").open("a") as config:
-            config.write("\n[load]\nmax_lag = 0.35\nrecovery = 1.0\n")
+            config.write("\n[load]\nmax_lag = 0.6\nrecovery = 1.0\n")
         with (tmp_path / "log").open("wb") as log:
             daemon = subprocess.Popen(
                 program("run", "--config", str(tmp_path / "config.toml")),
@@ -90,9 +90,9 @@ def test_a_daemon_that_is_held_up_says_so_and_recovers(tmp_path: Path, endpoint:
                 while time.monotonic() < end:
                     if held_up:
                         daemon.send_signal(signal.SIGSTOP)
-                        time.sleep(0.5)
+                        time.sleep(0.8)
                         daemon.send_signal(signal.SIGCONT)
-                        time.sleep(0.5)
+                        time.sleep(0.4)
                     while not loads.empty() or not held_up:
                         found, message = loads.get(timeout=LIMIT_S)
                         if found == level:
