@@ -64,8 +64,48 @@ def recovered(graph: KeyframeGraph, keys: list[int]) -> list[LevelEdge]:
     part_of_row = part[np.searchsorted(gone, np.where(at_i[rows], edges.i[rows], edges.j[rows]))]
     found: list[LevelEdge] = []
     for k in range(count):
-        found += _Marginal(graph, rows[part_of_row == k], gone).tree()
+        part_rows = rows[part_of_row == k]
+        try:
+            found += _Marginal(graph, part_rows, gone).tree()
+        except np.linalg.LinAlgError:
+            # Out of numbers: a map that has lost what these edges knew is better than none.
+            graph.loose_bridges += 1
+            found += _bridges(graph, part_rows, gone)
     return found
+
+
+def _bridges(graph: KeyframeGraph, rows: IndexArray, gone: IndexArray) -> list[LevelEdge]:
+    """Edges that keep the odometry a chain where keyframes go, at the present poses, and say next to nothing."""
+    begins, ends = _chain_ends(graph, rows, gone)
+    nb, nodes = graph.bias.size, graph.nodes
+    return [
+        LevelEdge(
+            "odometry",
+            p,
+            q,
+            graph.relative(p, q),
+            np.diag(LOOSE**-2.0),
+            nodes.height(q) - nodes.height(p),
+            LOOSE_HEIGHT**-2.0,
+            np.zeros((3, nb)),
+            graph.bias.copy(),
+        )
+        for p, q in zip(begins.tolist(), ends.tolist(), strict=True)
+    ]
+
+
+def _chain_ends(graph: KeyframeGraph, rows: IndexArray, gone: IndexArray) -> tuple[IndexArray, IndexArray]:
+    """Keyframes that stay before and after each stretch of odometry that goes, growing.
+
+    Raises:
+        ValueError: the first or the last keyframe of a chain of odometry goes.
+    """
+    i, j = graph.edges.i[rows], graph.edges.j[rows]
+    steps = ~graph.edges.loop[rows]
+    begins, ends = np.sort(i[steps & ~np.isin(i, gone)]), np.sort(j[steps & ~np.isin(j, gone)])
+    if len(begins) != len(ends) or (begins >= ends).any():
+        raise ValueError("the first and the last keyframe of a graph cannot be taken out of it")
+    return begins, ends
 
 
 def combined(graph: KeyframeGraph, one: LevelEdge, other: LevelEdge) -> LevelEdge:
@@ -111,11 +151,7 @@ class _Marginal:
         i, j = edges.i[rows], edges.j[rows]
         self._ids = ids = np.unique(np.concatenate([i, j]))
         self._around = np.flatnonzero(~np.isin(ids, gone))
-        steps = ~edges.loop[rows]
-        self._begins = np.sort(i[steps & ~np.isin(i, gone)])
-        self._ends = np.sort(j[steps & ~np.isin(j, gone)])
-        if len(self._begins) != len(self._ends) or (self._begins >= self._ends).any():
-            raise ValueError("the first and the last keyframe of a graph cannot be taken out of it")
+        self._begins, self._ends = _chain_ends(graph, rows, gone)
         relative = graph.relatives(i, j)
         a, b, m, n = np.searchsorted(ids, i), np.searchsorted(ids, j), len(rows), len(ids)
         self._r = geometry.se2_log(geometry.se2_compose(geometry.se2_inverse(graph.measured(rows)), relative))

@@ -40,6 +40,7 @@ class KeyframeGraph:
         edges: all of them in the order of their making, those taken back too.
         bias: estimate of the slow biases, shape (nb,).
         bias_prior, bias_prior_information: what the odometry alone says of them.
+        loose_bridges: how often what keyframes knew that went could not be computed, and was lost.
     """
 
     def __init__(self) -> None:
@@ -48,6 +49,7 @@ class KeyframeGraph:
         self.bias: FloatArray = np.zeros(0)
         self.bias_prior: FloatArray = np.zeros(0)
         self.bias_prior_information: FloatArray = np.zeros((0, 0))
+        self.loose_bridges = 0
         self._pattern: tuple[tuple[int, int], SystemPattern] | None = None
 
     def optimise(self) -> None:

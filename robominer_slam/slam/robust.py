@@ -374,6 +374,7 @@ class RobustBackend:
             bare=tuple(self._map.bare),
             counts={
                 **{f"closures.{name}": count for name, count in self.closures.counts.items()},
+                "loose_bridges": self._graph.loose_bridges,
                 "points.in_memory": self._patches.points_in_memory,
                 "points.fetched": self._patches.fetched,
             },
