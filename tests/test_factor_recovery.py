@@ -225,15 +225,15 @@ def test_the_odometry_of_a_drive_without_end_never_becomes_too_loose_to_be_solve
     assert np.isfinite(graph.covariance([k])).all()
 
 
+@pytest.mark.filterwarnings("ignore:invalid value")
 def test_where_numbers_run_out_the_odometry_stays_a_chain_and_the_loss_is_counted():
     graph = straight(12, [(1, 9), (4, 8)])
     places = graph.nodes.poses.copy()
-    # Edges of which some say a million million million times more than others: no marginal can be had of them.
+    # Edges of which no marginal can be had.
     graph.edges.information[graph.edges.loop] = np.nan
     remove_keyframes(graph, [4, 5])
     assert graph.loose_bridges == 1
-    steps = [
-        (int(i), int(j)) for i, j, loop in zip(graph.edges.i, graph.edges.j, graph.edges.loop, strict=True) if not loop
-    ]
-    assert sorted(steps) == [(0, 1), (1, 2), (2, 3), (3, 6), (6, 7), (7, 8), (8, 9), (9, 10), (10, 11)]
+    edges = graph.edges
+    steps = sorted(zip(edges.i[~edges.loop].tolist(), edges.j[~edges.loop].tolist(), strict=True))
+    assert steps == [(0, 1), (1, 2), (2, 3), (3, 6), (6, 7), (7, 8), (8, 9), (9, 10), (10, 11)]
     np.testing.assert_allclose(graph.nodes.poses, np.delete(places, [4, 5], axis=0))

@@ -184,6 +184,8 @@ class _Marginal:
         slack = (gain @ edges.slack[rows] @ gain.transpose(0, 1, 3, 2)).sum(axis=1)
         covariance = covariance * _excess(A, covariance, self._P)
         variance = variance * _excess(A_z, variance[:, None, None], self._P_z)
+        if not (np.isfinite(covariance).all() and np.isfinite(variance).all() and np.isfinite(moved).all()):
+            raise np.linalg.LinAlgError("what the edges say has no marginal")
         fade = float(edges.fade[rows].min())
         return [
             LevelEdge(
