@@ -74,7 +74,7 @@ def test_twenty_replugs_half_of_them_under_another_name(tmp_path, caplog):
     other = FakeDevice(tmp_path / "tty_other", HALL)
     device = FakeDevice(tmp_path / "tty0")
     caplog.set_level(logging.INFO, serial_reader.__name__)
-    worst, name = 0.0, "tty0"
+    took, name = [], "tty0"
     try:
         with SerialReader([settings(tmp_path, "imu"), settings(tmp_path, "whiskers")]) as reader:
             first(reader, ImuSample)
@@ -88,14 +88,16 @@ def test_twenty_replugs_half_of_them_under_another_name(tmp_path, caplog):
                 device = FakeDevice(tmp_path / name)
                 back = time.monotonic()
                 first(reader, ImuSample)
-                worst = max(worst, time.monotonic() - back)
+                took.append(time.monotonic() - back)
                 first(reader, HallFrame)
             assert open_files() <= before
             assert reader.status()[1].counters.get("faults", 0) == 0
     finally:
         device.close()
         other.close()
-    assert worst < 2.0
+    # A busy machine may stop all of this for a second, once.
+    assert sorted(took)[-2] < 2.0
+    assert sorted(took)[len(took) // 2] < 1.0
     # Gone, not there, found, streaming: four lines a cycle at most.
     assert len([r for r in caplog.records if "device imu" in r.getMessage()]) <= 4 * 20 + 4
 

@@ -113,7 +113,7 @@ def test_spherical_frames_are_used_and_directions_alone_touch_nothing(model):
         assert len(result.contacts.index) == touching
 
 
-def test_screw_angles_that_come_too_soon_are_passed_over_and_lose_nothing():
+def test_screw_angles_that_come_too_soon_wait_and_lose_nothing():
     speeds = ScrewAngleSpeeds(30_000_000)
     angle, told = np.zeros(4), []
     for k in range(9):
@@ -125,4 +125,11 @@ def test_screw_angles_that_come_too_soon_are_passed_over_and_lose_nothing():
     # The mean over both intervals, also where the speed changes in between.
     assert [(stamp, readings) for stamp, _, readings in told] == [(40_000_000 * k, 2) for k in range(1, 5)]
     np.testing.assert_allclose([speed for _, speed, _ in told], [1.5, 3.5, 5.5, 7.5])
+    assert speeds.waiting() is None
+    # One that waits can be had at any time, and then the next is told from there.
+    assert speeds.add(ScrewAngles(180_000_000, angle)) is None
+    stamp, speed = speeds.waiting()
+    assert (stamp, speeds.readings) == (180_000_000, 1)
+    np.testing.assert_allclose(speed, 9.0)
+    assert speeds.waiting() is None
     assert speeds.stale == 0

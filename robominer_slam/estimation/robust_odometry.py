@@ -48,7 +48,7 @@ from robominer_slam.float_array import of_floats
 FloatArray = NDArray[np.float64]
 Source = Literal["fused", "odometry"]
 
-#: Encoders may be read fifty or a hundred times a second: the filter moves on less often than that.
+#: Encoders may be read fifty or a hundred times a second: unless it is asked, the filter goes on less often than that.
 LEAST_SCREW_INTERVAL_NS = 30_000_000
 #: Squared deviations between screws and gyro beyond which the screws are trusted less.
 DISAGREEMENT = 4.0
@@ -120,7 +120,7 @@ class RobustOdometry:
         """Take the contacts of a whisker frame; `state_at` then knows of them."""
         if self._drag is None:
             return
-        self._predict(stamp_ns)
+        self._go_on(stamp_ns)
         ekf = self._filter
         found = self._drag.measure(stamp_ns, contacts, ekf.x[VELOCITY], ekf.P[VELOCITY, VELOCITY])
         if found is None:
@@ -142,7 +142,7 @@ class RobustOdometry:
 
     def state_at(self, stamp_ns: int) -> OdometryState:
         """The state at a time that is not before the last measurement's."""
-        self._predict(stamp_ns)
+        self._go_on(stamp_ns)
         if self._state is not None and self._state.stamp_ns == stamp_ns:
             return self._state
         x, P = self._filter.x, self._filter.P
@@ -165,7 +165,7 @@ class RobustOdometry:
 
     def mark_keyframe(self, stamp_ns: int) -> KeyframeMotion:
         """Motion since the last mark (or the start); the present pose becomes the new reference."""
-        self._predict(stamp_ns)
+        self._go_on(stamp_ns)
         x, P, b = self._filter.x, self._filter.P, self._bias
         T, covariance, jacobian = self._space.motion(x[REL], *given_bias(x, P, b))
         marked, self._marked_ns = self._marked_ns, stamp_ns
@@ -194,7 +194,7 @@ class RobustOdometry:
             offset: of (x, y, yaw) in odom, measured less predicted, shape (3,).
             information: of it, shape (3, 3); directions without information are left alone.
         """
-        self._predict(stamp_ns)
+        self._go_on(stamp_ns)
         told = match_measurement(self._filter.x, self._match, offset, information)
         if told is not None:
             self._filter.correct(*told)
@@ -247,7 +247,7 @@ class RobustOdometry:
         still = max(map(abs, speed.tolist())) < settings.still_screw_speed
         self._input = screws[:2]
         if still:
-            creep = settings.sigma_still**2
+            creep = settings.sigma_still**2 / readings
             self._Q_input = [creep, 0.0, 0.0, creep]
         else:
             mode, distrust = (settings.slip_mode_weight * slip) ** 2 / readings, self._distrust / readings
@@ -263,6 +263,13 @@ class RobustOdometry:
             distance = self._filter.correct(*comparison.measurement(self._filter.x))
             self._distrust = max(1.0, distance / DISAGREEMENT)
             comparison.start(running=True)
+
+    def _go_on(self, stamp_ns: int) -> None:
+        """Predict, with the screws' last reading, which may have waited for another."""
+        waiting = self._angles.waiting()
+        if waiting is not None:
+            self._take_speed(*waiting, self._angles.readings)
+        self._predict(stamp_ns)
 
     def _predict(self, stamp_ns: int) -> None:
         previous = self._stamp_ns

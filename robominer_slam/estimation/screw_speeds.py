@@ -18,10 +18,10 @@ MAX_INTERVAL_S = 0.5
 class ScrewAngleSpeeds:
     """Mean speeds between readings of the screws' cumulative angles.
 
-    Readings that follow each other closely may be passed over: the angles add up, so the next one tells all of it.
+    Readings that follow each other closely may wait: the angles add up, so the next one tells all of it.
 
     Args:
-        least_interval_ns: readings sooner than this after the last one used are passed over.
+        least_interval_ns: readings sooner than this after the last one used wait for the next, or for `waiting`.
 
     Attributes:
         stale: readings that gave none, out of order or after a gap.
@@ -31,7 +31,8 @@ class ScrewAngleSpeeds:
     def __init__(self, least_interval_ns: int = 0) -> None:
         self._least_interval_ns = least_interval_ns
         self._before: ScrewAngles | None = None
-        self._passed_over = 0
+        self._waiting: ScrewAngles | None = None
+        self._waited = 0
         self.stale = 0
         self.readings = 0
 
@@ -39,9 +40,22 @@ class ScrewAngleSpeeds:
         """Speeds since the last reading used, shape (4,), rad/s; None for the first and where the gap is too long."""
         before = self._before
         if before is not None and 0 < reading.stamp_ns - before.stamp_ns < self._least_interval_ns:
-            self._passed_over += 1
+            self._waiting = reading
+            self._waited += 1
             return None
-        self._before, self.readings, self._passed_over = reading, self._passed_over + 1, 0
+        return self._use(reading)
+
+    def waiting(self) -> tuple[int, FloatArray | None] | None:
+        """Use the reading that waits: its stamp, ns, and the speeds; None where none waits."""
+        reading = self._waiting
+        if reading is None:
+            return None
+        self._waited -= 1
+        return reading.stamp_ns, self._use(reading)
+
+    def _use(self, reading: ScrewAngles) -> FloatArray | None:
+        before, self._before = self._before, reading
+        self.readings, self._waited, self._waiting = self._waited + 1, 0, None
         if before is None:
             return None
         interval = (reading.stamp_ns - before.stamp_ns) * 1e-9
