@@ -16,8 +16,8 @@ RANGE_MARGIN = np.deg2rad(3.0)
 MOST = np.deg2rad(85.0)
 #: A change of what the neighbours add that is not worth another evaluation, mT: 0.06 deg.
 NEGLIGIBLE_MT = 0.02
-#: A rod's direction that has changed by less adds what it added: half a reading's noise, 0.0005 mT to a neighbour. (At four
-#: times the noise the lag is seen: without a gyro the heading drifts a tenth faster.)
+#: A rod's direction that has changed by less adds what it added: half a reading's noise, 0.0005 mT to a neighbour. (At
+#: four times the noise the lag is seen: without a gyro the heading drifts a tenth faster.)
 SAME_DIRECTION = 0.005
 #: Evaluations at most: the second one's error is a hundredth of the neighbours' field.
 ITERATIONS = 2
