@@ -82,7 +82,7 @@ def test_twenty_replugs_half_of_them_under_another_name(tmp_path, caplog):
             before = open_files()
             for cycle in range(20):
                 device.close()
-                (tmp_path / name).unlink()
+                (tmp_path / name).unlink(missing_ok=True)
                 wait_for_state(reader, "absent")
                 name = f"tty{cycle}" if cycle % 2 else name
                 device = FakeDevice(tmp_path / name)
@@ -116,7 +116,7 @@ with SerialReader([DeviceSettings(n, "auto", carries=n) for n in ("whiskers", "i
     first(reader, HallFrame), first(reader, ImuSample)
     assert [s.path for s in reader.status()] == ["/dev/ttyACM1", "/dev/ttyACM0"], reader.status()
     whiskers.close()
-    (dev / "ttyACM1").unlink()
+    (dev / "ttyACM1").unlink(missing_ok=True)
     wait_for_state(reader, "absent")
     whiskers = FakeDevice(dev / "ttyUSB7", HALL)
     back = time.monotonic()

@@ -109,7 +109,7 @@ def test_a_daemon_that_is_held_up_says_so_and_recovers(tmp_path: Path, endpoint:
         assert "left out: map detail, loop search" in text
         assert "Traceback" not in text
     finally:
-        for process in (robot, daemon):
+        for process in (daemon, robot):
             if process is not None:
                 process.kill()
                 process.wait()

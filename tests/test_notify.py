@@ -156,6 +156,9 @@ def test_the_life_of_a_service(
     robot.send_signal(signal.SIGSTOP)
     manager.until(lambda m: "whiskers silent" in m, "that the whiskers are silent")
     manager.until(lambda m: m == "WATCHDOG=1", "a sign of life")
+    # The names go too: another test's terminal may get the number, and the daemon would take it for its own.
+    for name in (tmp_path / "dev").iterdir():
+        name.unlink()
     robot.kill()
     manager.until(lambda m: "whiskers absent" in m, "that the whiskers are gone")
     manager.until(lambda m: m == "WATCHDOG=1", "a sign of life")

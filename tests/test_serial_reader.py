@@ -35,6 +35,7 @@ class FakeDevice:
         self.slave_name = os.ttyname(slave)
         # The slave's last descriptor closed here would end the terminal before the reader opens it.
         self.slave = slave
+        self.link = link
         link.unlink(missing_ok=True)
         link.symlink_to(self.slave_name)
         os.set_blocking(self.master, False)
@@ -68,6 +69,8 @@ class FakeDevice:
     def close(self) -> None:
         self.stop.set()
         self.thread.join()
+        # First the name: the terminal's number may be another's at once.
+        self.link.unlink(missing_ok=True)
         os.close(self.slave)
         os.close(self.master)
 
@@ -128,7 +131,7 @@ def test_a_device_that_vanishes_is_used_again_when_it_is_back(tmp_path):
     with SerialReader([DeviceSettings("imu", str(link))]) as reader:
         first(reader, ImuSample)
         device.close()
-        link.unlink()
+        link.unlink(missing_ok=True)
         lost = wait_for_state(reader, "absent")
         assert "failed" in lost.fault or "not there" in lost.fault
         returned = time.monotonic()
