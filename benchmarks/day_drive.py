@@ -20,28 +20,21 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import click
 import numpy as np
 
 from benchmarks.random_drives import measurements, simulated_robot
-from calibration.polynomial import PolynomialModel
 from drivers.device import DeviceStatus
 from drivers.measurement import HallFrame, Measurement, ScrewAngles
 from robominer_slam import daemon
-from robominer_slam.assembly import build_pipeline
 from robominer_slam.calibrated_array import CalibratedArray
-from robominer_slam.configuration.model import Configuration
 from robominer_slam.configuration.reload import Reload
 from robominer_slam.frame_result import FrameResult
-from robominer_slam.layout import WhiskerLayout
 from robominer_slam.notify import Notifier
-from robominer_slam.pipeline import Pipeline
 from robominer_slam.publishing.robot_settings import robot_settings
 from robominer_slam.publishing.zenoh_session import ZenohBus
 from robominer_slam.replay import prepare
-from robominer_slam.slam.saved_map import SavedMap
 from robominer_slam.store import MapStore
 from robominer_slam.supervision import Supervision
 from sim_backend import world as worlds
@@ -204,6 +197,16 @@ class Watch:
             writer.writerows([getattr(one, field.name) for field in fields(Sample)] for one in self.samples)
 
 
+class WatchedDaemon(daemon.Daemon):
+    """Tells the watch of each frame."""
+
+    watch: Watch
+
+    def _frame(self, result: FrameResult) -> None:
+        super()._frame(result)
+        self.watch.frame(self, result)
+
+
 def plot(samples: list[Sample], path: Path) -> None:
     """Memory, disk, files and threads, and the error over the hours."""
     from matplotlib.figure import Figure
@@ -263,22 +266,22 @@ def main(hours: float, out: Path) -> None:
     watch = Watch(source, folder, out)
     watch.set_heading(float(np.asarray(worlds.load("thesis").scenarios[5])[0][2]))
     configuration = inputs.configuration
-    daemon.time = SimpleNamespace(monotonic_ns=lambda: source.now_ns)  # type: ignore[attr-defined]
-    daemon.build_pipeline = _synchronous  # type: ignore[attr-defined]
     prefix = f"robominer/{configuration.robot.id}"
     store = MapStore(folder / "map.db", configuration.store.sync_s, configuration.robot.id, "")
     supervision = Supervision(Notifier(), Reload(RECORDING, configuration))
     with ZenohBus(robot_settings(configuration.zenoh, folder, prefix), prefix) as bus, store:
-        running = daemon.Daemon(
-            configuration, CalibratedArray(inputs.layout, inputs.model), source, bus, store, supervision
+        array = CalibratedArray(inputs.layout, inputs.model)
+        running = WatchedDaemon(
+            configuration,
+            array,
+            source,
+            bus,
+            store,
+            supervision,
+            monotonic_ns=lambda: source.now_ns,
+            execution="synchronous",
         )
-        published = running._publisher.frame
-
-        def frame(result: FrameResult, *, sparing: bool = False) -> None:
-            published(result, sparing=sparing)
-            watch.frame(running, result)
-
-        running._publisher.frame = frame  # type: ignore[method-assign]
+        running.watch = watch
         running.run(stop)
     plot(watch.samples, out / "day.png")
     text = table(watch.samples)
@@ -288,17 +291,6 @@ def main(hours: float, out: Path) -> None:
 
 def _entries(name: str) -> int:
     return sum(1 for _ in Path("/proc/self", name).iterdir())
-
-
-def _synchronous(
-    configuration: Configuration,
-    layout: WhiskerLayout,
-    model: PolynomialModel,
-    _: str,
-    known: SavedMap | None,
-    folder: Path,
-) -> Pipeline:
-    return build_pipeline(configuration, layout, model, "synchronous", known, folder)
 
 
 if __name__ == "__main__":

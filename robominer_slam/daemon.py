@@ -10,6 +10,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from typing import Literal
 
 from robominer_slam import status_report
 from robominer_slam.assembly import build_pipeline, build_slam
@@ -60,7 +61,24 @@ class Daemon:
         store: MapStore,
         supervision: Supervision,
         known: SavedMap | None = None,
+        *,
+        monotonic_ns: Callable[[], int] = time.monotonic_ns,
+        execution: Literal["threaded", "synchronous"] = "threaded",
     ) -> None:
+        """Take the parts.
+
+        Args:
+            configuration: of the robot.
+            array: layout and calibration.
+            source: of measurements.
+            bus: to publish on.
+            store: of the map.
+            supervision: what systemd is told.
+            known: the map to start in.
+            monotonic_ns: the clock that measurements are stamped by; a recording's where one is driven through.
+            execution: of the back-end: in its own thread, or where the measurements are processed, as in a replay.
+        """
+        self._monotonic_ns, self._execution = monotonic_ns, execution
         self._configuration = configuration
         self._layout = array.layout
         self._source = source
@@ -70,7 +88,7 @@ class Daemon:
         self._lock = threading.Lock()
         self._clock = WallClock()
         self._carries = {one.name: one.carries for one in device_settings(configuration)}
-        self._pipeline = build_pipeline(configuration, array.layout, array.model, "threaded", known, store.folder)
+        self._pipeline = build_pipeline(configuration, array.layout, array.model, execution, known, store.folder)
         self._map = KeyframeMap(configuration.map.point_voxel)
         self._publisher = Publisher(bus, self._clock, array.layout)
         self._map_service = MapService(bus, self._clock, self._map, configuration.map)
@@ -114,7 +132,7 @@ class Daemon:
         self._map_service.frame(result, sparing=sparing)
         runner = self._pipeline.runner
         behind_s = 0.0 if runner is None else runner.behind_ns * 1e-9
-        self._shedding.frame((time.monotonic_ns() - result.stamp_ns) * 1e-9, behind_s)
+        self._shedding.frame((self._monotonic_ns() - result.stamp_ns) * 1e-9, behind_s)
         if result.stamp_ns - self._telemetry_ns >= TELEMETRY_INTERVAL_NS:
             self._telemetry_ns = result.stamp_ns
             self._telemetry(result)
@@ -148,7 +166,7 @@ class Daemon:
         return health
 
     def _status(self) -> None:
-        now = time.monotonic_ns()
+        now = self._monotonic_ns()
         if now - self._status_ns < STATUS_INTERVAL_NS:
             return
         self._status_ns = now
@@ -209,7 +227,7 @@ class Daemon:
 
     def _new_map(self) -> None:
         self._store.new_map(self._configuration.robot.id, "")
-        self._pipeline.start_new_map(*build_slam(self._configuration, "threaded", page_folder=self._store.folder))
+        self._pipeline.start_new_map(*build_slam(self._configuration, self._execution, page_folder=self._store.folder))
         self._map_service.new_map()
 
     def _declare_queries(self) -> None:

@@ -46,10 +46,10 @@ installed() { # root, architecture
   deb=$(package "$2")
   fresh_root "$1" "$2"
   say "$2: bare root of $(size_MB "$1") MB, package of $(du -k "$deb" | cut -f1) kB"
-  cp "$deb" "$BOARD/$1/root/"
+  cp "$deb" "$BOARD/$1/opt/"
   on_root "$1" apt-get -qq update
   from=$SECONDS
-  on_root "$1" apt-get -y --no-install-recommends install "/root/${deb##*/}" >"$BOARD/install-$SUITE-$2.log" 2>&1 ||
+  on_root "$1" apt-get -y --no-install-recommends install "/opt/${deb##*/}" >"$BOARD/install-$SUITE-$2.log" 2>&1 ||
     fail "installation; see $BOARD/install-$SUITE-$2.log"
   on_root "$1" apt-get clean
   say "$2: installed in $((SECONDS - from)) s; $(size_MB "$1") MB"

@@ -16,27 +16,22 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import stages
 
 from calibration.angle_estimator import AngleEstimator
-from calibration.polynomial import PolynomialModel
 from drivers.device import Device, DeviceStatus
 from drivers.measurement import HallFrame, ImuSample, Measurement, ScrewAngles
 from drivers.recording_reader import Recording
 from drivers.settings import DeviceSettings
 from robominer_slam import daemon, pipeline
-from robominer_slam.assembly import build_pipeline
 from robominer_slam.calibrated_array import CalibratedArray
 from robominer_slam.configuration.devices import device_settings
-from robominer_slam.configuration.model import Configuration
 from robominer_slam.configuration.reload import Reload
 from robominer_slam.contacts import ContactModel
 from robominer_slam.estimation.robust_odometry import RobustOdometry
-from robominer_slam.layout import WhiskerLayout
 from robominer_slam.map_service import MapService
 from robominer_slam.notify import Notifier
 from robominer_slam.pipeline import Pipeline
@@ -47,7 +42,6 @@ from robominer_slam.replay import prepare
 from robominer_slam.slam.backend_runner import SynchronousRunner
 from robominer_slam.slam.composite_scan import CompositeScan
 from robominer_slam.slam.robust import RobustBackend
-from robominer_slam.slam.saved_map import SavedMap
 from robominer_slam.slam.session_backend import SessionBackend
 from robominer_slam.store import MapStore
 from robominer_slam.supervision import Supervision
@@ -194,16 +188,23 @@ def main() -> None:
         devices = [Device(one) for one in device_settings(configuration)]
         length = min(seconds, inputs.recording.duration_ns * 1e-9 + 1.0)
         source = RecordedDevices(inputs.recording, devices, length, stop)
-        # By the recording's time.
-        daemon.time = SimpleNamespace(monotonic_ns=lambda: source.now_ns)  # type: ignore[attr-defined]
-        daemon.build_pipeline = _synchronous  # type: ignore[attr-defined]
         prefix = f"robominer/{configuration.robot.id}"
         store = MapStore(Path(folder) / "map.db", configuration.store.sync_s, configuration.robot.id, "")
         supervision = Supervision(Notifier(), Reload(path, configuration))
         section = configuration.zenoh.model_copy(update={"listen": (ENDPOINT,)})
         with ZenohBus(robot_settings(section, Path(folder), prefix), prefix) as bus, store:
             array = CalibratedArray(inputs.layout, inputs.model)
-            running = daemon.Daemon(configuration, array, source, bus, store, supervision)
+            # By the recording's time.
+            running = daemon.Daemon(
+                configuration,
+                array,
+                source,
+                bus,
+                store,
+                supervision,
+                monotonic_ns=lambda: source.now_ns,
+                execution="synchronous",
+            )
             stages.begin("main loop")
             running.run(stop)
             stages.begin("end")
@@ -212,17 +213,6 @@ def main() -> None:
             print(json.dumps(summary | {"seconds": source.driven_s}), flush=True)
             if "hold" in sys.argv:
                 sys.stdin.read()
-
-
-def _synchronous(
-    configuration: Configuration,
-    layout: WhiskerLayout,
-    model: PolynomialModel,
-    _: str,
-    known: SavedMap | None,
-    page_folder: Path,
-) -> Pipeline:
-    return build_pipeline(configuration, layout, model, "synchronous", known, page_folder)
 
 
 if __name__ == "__main__":

@@ -87,7 +87,7 @@ class RecordingSource:
         """
         raise QueryError(f"map {number}: this is a recording: there are no saved maps")
 
-    def command(self, name: str, parameters: Mapping[str, str]) -> CommandResult:  # noqa: ARG002
+    def command(self, name: str, parameters: Mapping[str, str]) -> CommandResult:  # noqa: ARG002 - named as in `Session`
         """Nobody is there to do anything."""
         return CommandResult(Outcome.REFUSED, "this is a recording: there is no robot to command")
 

@@ -15,8 +15,8 @@ Publisher: TypeAlias = zenoh.Publisher | ext.AdvancedPublisher
 MISS_HEARTBEAT_S = 1.0
 
 
-def declare(session: zenoh.Session, key: str, qos: Qos) -> Publisher:
-    """A publisher of a whole key."""
+def declare(session: zenoh.Session, key: str, qos: Qos, heartbeat_s: float = MISS_HEARTBEAT_S) -> Publisher:
+    """A publisher of a whole key; one with a cache says so often up to where it has sent, s."""
     if qos.cache == 0:
         return session.declare_publisher(
             key, priority=qos.priority, congestion_control=qos.congestion, express=qos.express
@@ -28,7 +28,7 @@ def declare(session: zenoh.Session, key: str, qos: Qos) -> Publisher:
         congestion_control=qos.congestion,
         express=qos.express,
         cache=ext.CacheConfig(qos.cache),
-        sample_miss_detection=ext.MissDetectionConfig(sporadic_heartbeat=MISS_HEARTBEAT_S, heartbeat=None),
+        sample_miss_detection=ext.MissDetectionConfig(sporadic_heartbeat=heartbeat_s, heartbeat=None),
         publisher_detection=True,
     )
 

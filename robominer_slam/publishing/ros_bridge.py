@@ -9,18 +9,15 @@ import itertools
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import zenoh
-from zenoh import ext
 
 from robominer_slam.publishing.keys import encoding_of, qos_of
-from robominer_slam.publishing.publishers import somebody_listens
+from robominer_slam.publishing.publishers import Publisher, declare, somebody_listens
 from robominer_slam.publishing.rmw_zenoh import RmwZenohLayout
 from robominer_slam.publishing.ros2dds import Ros2DdsLayout
 from robominer_slam.publishing.ros_topics import RosBridgeName, RosLayout, RosTopic
 
-_Publisher: TypeAlias = zenoh.Publisher | ext.AdvancedPublisher
 #: As rmw_zenoh's own publishers of latched topics (SAMPLE_MISS_DETECTION_HEARTBEAT_PERIOD), s.
 _HEARTBEAT_S = 0.5
 
@@ -65,7 +62,7 @@ def ros_readable(layout: RosLayout) -> tuple[str, ...]:
 @dataclass(frozen=True, slots=True)
 class _Copy:
     topic: RosTopic
-    publisher: _Publisher
+    publisher: Publisher
     encoding: str
     sequence: Iterator[int]
 
@@ -115,19 +112,6 @@ def open_bridge(session: zenoh.Session, settings: RosSettings | None, prefix: st
     return None if layout is None else RosBridge(session, layout)
 
 
-def _declare(session: zenoh.Session, key: str, topic: RosTopic) -> _Publisher:
+def _declare(session: zenoh.Session, key: str, topic: RosTopic) -> Publisher:
     qos = qos_of(topic.key)
-    if not topic.latched:
-        return session.declare_publisher(
-            key, priority=qos.priority, congestion_control=qos.congestion, express=qos.express
-        )
-    return ext.declare_advanced_publisher(
-        session,
-        key,
-        priority=qos.priority,
-        congestion_control=qos.congestion,
-        express=qos.express,
-        cache=ext.CacheConfig(topic.depth),
-        sample_miss_detection=ext.MissDetectionConfig(sporadic_heartbeat=_HEARTBEAT_S, heartbeat=None),
-        publisher_detection=True,
-    )
+    return declare(session, key, qos._replace(cache=topic.depth if topic.latched else 0), _HEARTBEAT_S)
