@@ -39,12 +39,14 @@ class DeviceClock:
     """Maps a wrapping 32-bit microsecond clock to monotonic host nanoseconds.
 
     Attributes:
+        synchronised: true once at least one round trip was made since the start or the last jump.
         jumps: how often the device's clock jumped (a restart of the device, mostly).
         drift: estimated rate error of the device's clock, dimensionless.
         uncertainty_ns: the mapping's bound: the trips' own bounds, in the mean that the fit takes of their midpoints.
     """
 
     def __init__(self) -> None:
+        self.synchronised = False
         self.jumps = 0
         self.drift = 0.0
         self.uncertainty_ns = 0
@@ -54,11 +56,6 @@ class DeviceClock:
         self._reference_ns = 0
 
     @property
-    def synchronised(self) -> bool:
-        """True once at least one round trip was made since the start or the last jump."""
-        return bool(self._trips)
-
-    @property
     def offset_ns(self) -> int:
         """Host time minus device time now, ns; 0 while not synchronised."""
         return self._reference_ns - self._reference_us * 1000 if self._trips else 0
@@ -66,6 +63,7 @@ class DeviceClock:
     def reset(self) -> None:
         """Forget everything: the device was opened anew."""
         self._trips.clear()
+        self.synchronised = False
         self._last_device_us = None
         self.drift = 0.0
 
@@ -76,7 +74,8 @@ class DeviceClock:
             return device_us
         step = (device_us - self._last_device_us + WRAP_US // 2) % WRAP_US - WRAP_US // 2
         unwrapped = self._last_device_us + step
-        self._last_device_us = max(self._last_device_us, unwrapped)
+        if step > 0:
+            self._last_device_us = unwrapped
         return unwrapped
 
     def add_round_trip(self, sent_ns: int, received_ns: int, device_us: int) -> None:
@@ -90,6 +89,7 @@ class DeviceClock:
                 self.reset()
                 trip = RoundTrip(self.unwrap(device_us), trip.host_ns, half)
         self._trips.append(trip)
+        self.synchronised = True
         self._fit()
 
     def to_host_ns(self, device_us: int) -> int:
@@ -98,7 +98,7 @@ class DeviceClock:
         Raises:
             RuntimeError: not synchronised yet.
         """
-        if not self._trips:
+        if not self.synchronised:
             raise RuntimeError("the device's clock is not synchronised yet")
         return self._map(self.unwrap(device_us))
 

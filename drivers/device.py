@@ -7,6 +7,7 @@ first: it is listened to. A silent USB device is `resetting` from time to time.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass
 from typing import Literal
@@ -45,6 +46,8 @@ DeviceState = Literal["absent", "probing", "synchronising", "streaming", "silent
 
 #: A device that says nothing for this long is reported as silent.
 SILENT_NS = 1_000_000_000
+#: Encoders count modulo 2^32.
+WRAP, HALF_WRAP = 0xFFFFFFFF, 0x80000000
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +88,7 @@ class Device:
         self.heard: Counter[str] = Counter()
         self._last_heard_ns = 0
         self._ticks: tuple[int, ...] | None = None
-        self._turned = np.zeros(4, dtype=np.int64)
+        self._turned = [0] * 4
 
     def _new_decoder(self) -> Decoder:
         one = self.settings
@@ -198,10 +201,11 @@ class Device:
 
     def _unwrap(self, ticks: tuple[int, ...]) -> FloatArray:
         if self._ticks is not None:
-            step = (np.array(ticks, dtype=np.int64) - np.array(self._ticks, dtype=np.int64)) & 0xFFFFFFFF
-            self._turned += np.where(step >= 1 << 31, step - (1 << 32), step)
+            for screw, (now, before) in enumerate(zip(ticks, self._ticks, strict=True)):
+                self._turned[screw] += ((now - before + HALF_WRAP) & WRAP) - HALF_WRAP
         self._ticks = ticks
-        return self._turned.astype(np.float64) * (2.0 * np.pi / self.settings.ticks_per_turn)
+        per_tick = 2.0 * math.pi / self.settings.ticks_per_turn
+        return np.array([turned * per_tick for turned in self._turned])
 
     def status(self) -> DeviceStatus:
         """A copy of what status publishes."""

@@ -9,12 +9,13 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Callable
+from functools import lru_cache
 
 import numpy as np
 from cobs import cobs
 
 from drivers.counters import Counters
-from drivers.measurement import FloatArray
+from drivers.measurement import BoolArray, FloatArray
 from drivers.readings import (
     RADIANS_PER_SECOND_PER_RPM,
     EncoderReading,
@@ -38,6 +39,13 @@ MILLITESLA_PER_LSB = 0.01
 
 _HEADER = struct.Struct("<BBHI")
 _CRC = struct.Struct("<I")
+_SHORTEST = _HEADER.size + _CRC.size
+#: CRC-32 of any bytes followed by their own CRC-32.
+_CRC_OF_WHOLE = 0x2144DF1C
+_HALL_HEAD = struct.Struct("<BBH")
+_TICKS = struct.Struct(f"<{SCREW_COUNT}i")
+#: Made once: numpy takes as long to read a type's name as to convert six numbers.
+_INT16, _FLOAT32, _FLOAT64 = np.dtype("<i2"), np.dtype("<f4"), np.dtype(np.float64)
 
 
 class PayloadError(ValueError):
@@ -55,20 +63,16 @@ class FramedDecoder:
 
     def __init__(self) -> None:
         self.counters = Counters()
-        self._buffer = bytearray()
+        #: What came of the packet that is not complete.
+        self._buffer = b""
         self._skipping = False
         self._last: dict[int, tuple[int, int]] = {}
 
     def feed(self, data: bytes) -> list[Reading]:
         """Take some bytes; return the readings that they complete."""
         readings: list[Reading] = []
-        self._buffer += data
-        while True:
-            end = self._buffer.find(0)
-            if end < 0:
-                break
-            packet = bytes(self._buffer[:end])
-            del self._buffer[: end + 1]
+        *packets, self._buffer = (self._buffer + data).split(b"\0")
+        for packet in packets:
             if self._skipping:
                 # The rest of a packet whose start was thrown away as too long.
                 self._skipping = False
@@ -77,7 +81,7 @@ class FramedDecoder:
                 if reading is not None:
                     readings.append(reading)
         if len(self._buffer) > MAX_ENCODED_BYTES:
-            self._buffer.clear()
+            self._buffer = b""
             if not self._skipping:
                 self.counters["too_long"] += 1
             self._skipping = True
@@ -92,14 +96,13 @@ class FramedDecoder:
         except cobs.DecodeError:
             self.counters["bad_cobs"] += 1
             return None
-        if len(packet) < _HEADER.size + _CRC.size:
+        if len(packet) < _SHORTEST:
             self.counters["too_short"] += 1
             return None
-        body = packet[: -_CRC.size]
-        if zlib.crc32(body) != _CRC.unpack_from(packet, len(body))[0]:
+        if zlib.crc32(packet) != _CRC_OF_WHOLE:
             self.counters["bad_crc"] += 1
             return None
-        kind, version, sequence, device_time = _HEADER.unpack_from(body)
+        kind, version, sequence, device_time = _HEADER.unpack_from(packet)
         if version != VERSION:
             self.counters["bad_version"] += 1
             return None
@@ -110,7 +113,7 @@ class FramedDecoder:
         if not self._in_sequence(kind, sequence, device_time):
             return None
         try:
-            reading = parse(device_time, sequence, body[_HEADER.size :])
+            reading = parse(device_time, sequence, packet[_HEADER.size : -_CRC.size])
         except PayloadError:
             self.counters["bad_payload"] += 1
             return None
@@ -139,23 +142,31 @@ def _expect(payload: bytes, size: int) -> None:
 
 
 def _parse_hall(time_us: int, sequence: int, payload: bytes) -> Reading:
-    if len(payload) < 4:
+    if len(payload) < _HALL_HEAD.size:
         raise PayloadError("HALL without its head")
-    rows, cols, period = struct.unpack_from("<BBH", payload)
+    rows, cols, period = _HALL_HEAD.unpack_from(payload)
     count = rows * cols
-    bitmap = (count + 7) // 8
-    _expect(payload, 4 + bitmap + 6 * count)
+    at = _HALL_HEAD.size + (count + 7) // 8
+    _expect(payload, at + 6 * count)
     if count == 0:
         raise PayloadError("HALL of no sensors")
-    bits = np.frombuffer(payload, dtype=np.uint8, count=bitmap, offset=4)
-    valid = np.unpackbits(bits, bitorder="little")[:count].astype(np.bool_).reshape(rows, cols)
-    raw = np.frombuffer(payload, dtype="<i2", count=3 * count, offset=4 + bitmap)
-    field_mT = raw.reshape(rows, cols, 3) * MILLITESLA_PER_LSB
+    valid = _valid(payload[_HALL_HEAD.size : at], rows, cols)
+    raw = np.frombuffer(payload, _INT16, 3 * count, at)
+    field_mT = (raw.astype(_FLOAT64) * MILLITESLA_PER_LSB).reshape(rows, cols, 3)
     return HallReading(time_us, sequence, field_mT, valid, period)
 
 
+@lru_cache(maxsize=16)
+def _valid(bitmap: bytes, rows: int, cols: int) -> BoolArray:
+    """Which sensors were read, shape (rows, cols); the same frame after frame, so it is kept and read-only."""
+    bits = np.unpackbits(np.frombuffer(bitmap, np.uint8), count=rows * cols, bitorder="little")
+    valid = bits.astype(np.bool_).reshape(rows, cols)
+    valid.flags.writeable = False
+    return valid
+
+
 def _floats(payload: bytes, count: int, offset: int = 0) -> FloatArray:
-    return np.frombuffer(payload, dtype="<f4", count=count, offset=offset).astype(np.float64)
+    return np.frombuffer(payload, _FLOAT32, count, offset).astype(_FLOAT64)
 
 
 def _parse_imu(time_us: int, sequence: int, payload: bytes) -> Reading:
@@ -171,7 +182,7 @@ def _parse_encoders(time_us: int, sequence: int, payload: bytes) -> Reading:
     _expect(payload, 1 + 4 * count)
     if count != SCREW_COUNT:
         raise PayloadError(f"{count} screws, expected {SCREW_COUNT}")
-    return EncoderReading(time_us, sequence, struct.unpack_from(f"<{count}i", payload, 1))
+    return EncoderReading(time_us, sequence, _TICKS.unpack_from(payload, 1))
 
 
 def _parse_motors(time_us: int, sequence: int, payload: bytes) -> Reading:

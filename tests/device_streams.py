@@ -86,10 +86,7 @@ LINES = {
 
 def content(reading: Reading) -> tuple[object, ...]:
     """All values of a reading in a form that compares."""
-    return tuple(
-        value.tobytes() if isinstance(value, np.ndarray) else value
-        for value in (getattr(reading, name) for name in type(reading).__dataclass_fields__)
-    )
+    return tuple(value.tobytes() if isinstance(value, np.ndarray) else value for value in reading)
 
 
 def decoded(decoder: Decoder, pieces: list[bytes]) -> list[tuple[object, ...]]:
