@@ -22,7 +22,7 @@ def align(at: int, size: int) -> int:
 
 def padding(at: int, size: int) -> bytes:
     """The zeros between `at` and the next position aligned to `size`."""
-    return bytes(align(at, size) - at)
+    return bytes(-at & size - 1)
 
 
 def stamp(stamp_ns: int) -> bytes:

@@ -118,7 +118,9 @@ class Daemon:
                     if item is not None:
                         for result in self._pipeline.add(*item):
                             self._frame(result)
-                    self._status()
+                    now = self._monotonic_ns()
+                    if now - self._status_ns >= STATUS_INTERVAL_NS:
+                        self._status(now)
         finally:
             self._supervision.stopping()
             self._finish()
@@ -165,10 +167,7 @@ class Daemon:
             health |= Health.MEASUREMENTS_DROPPED
         return health
 
-    def _status(self) -> None:
-        now = self._monotonic_ns()
-        if now - self._status_ns < STATUS_INTERVAL_NS:
-            return
+    def _status(self, now: int) -> None:
         self._status_ns = now
         self._pipeline.shed = self._shedding.turn(now * 1e-9)
         stamp = self._clock.unix_ns(now)

@@ -25,19 +25,16 @@ UNKNOWN_VARIANCE_M2 = 100.0
 SPARING_FRAMES = 5
 
 
+#: Covariance in ROS order of a pose of which nothing else is known, and where in it that of x, y, yaw goes, flattened.
+_LEVEL = np.diag([0.0, 0.0, *LEVEL_VARIANCE, 0.0])
+_PLANAR = np.array([0, 1, 5, 6, 7, 11, 30, 31, 35])
+
+
 def full_covariance(planar: FloatArray) -> FloatArray:
     """Covariance (6, 6) in ROS order of one over (x, y, yaw)."""
-    (xx, xy, xw), (yx, yy, yw), (wx, wy, ww) = planar.tolist()
-    z, roll, pitch = LEVEL_VARIANCE
-    rows = [
-        xx, xy, 0.0, 0.0, 0.0, xw,
-        yx, yy, 0.0, 0.0, 0.0, yw,
-        0.0, 0.0, z, 0.0, 0.0, 0.0,
-        0.0, 0.0, 0.0, roll, 0.0, 0.0,
-        0.0, 0.0, 0.0, 0.0, pitch, 0.0,
-        wx, wy, 0.0, 0.0, 0.0, ww,
-    ]  # fmt: skip
-    return of_floats(rows).reshape(6, 6)
+    covariance = _LEVEL.copy()
+    covariance.put(_PLANAR, planar)
+    return covariance
 
 
 class Publisher:
@@ -51,6 +48,9 @@ class Publisher:
         self._bus = bus
         self._clock = clock
         self.frames = 0
+        # The correction changes with the back-end's results only.
+        self._T_map_odom: FloatArray | None = None
+        self._map_odom = np.zeros(7)
         now = clock.now_unix_ns()
         mounts = [
             StampedTransform(now, BASE, f"whisker_{i // layout.cols}_{i % layout.cols}", geometry.to_vector7(T))
@@ -70,7 +70,7 @@ class Publisher:
             covariance[[0, 1], [0, 1]] = np.maximum(covariance[[0, 1], [0, 1]], UNKNOWN_VARIANCE_M2)
         pose = geometry.to_vector7(result.T_map_base)
         self._bus.put("pose", pose_messages.pose_with_covariance(stamp, MAP, pose, covariance))
-        vx, vy, wz = odometry.velocity
+        vx, vy, wz = odometry.velocity.tolist()
         in_space = odometry.pose_covariance
         self._bus.put(
             "odom",
@@ -80,13 +80,15 @@ class Publisher:
                 BASE,
                 odom_pose,
                 full_covariance(odometry.covariance) if in_space is None else in_space,
-                np.array([vx, vy, 0.0, 0.0, 0.0, wz]),
+                of_floats([vx, vy, 0.0, 0.0, 0.0, wz]),
                 full_covariance(odometry.velocity_covariance),
             ),
         )
         transforms = [StampedTransform(stamp, ODOM, BASE, odom_pose)]
         if known:
-            transforms.insert(0, StampedTransform(stamp, MAP, ODOM, geometry.to_vector7(result.T_map_odom)))
+            if result.T_map_odom is not self._T_map_odom:
+                self._T_map_odom, self._map_odom = result.T_map_odom, geometry.to_vector7(result.T_map_odom)
+            transforms.insert(0, StampedTransform(stamp, MAP, ODOM, self._map_odom))
         self._bus.put("tf", pose_messages.transforms(transforms))
         contacts = result.contacts
         spared = sparing and self.frames % SPARING_FRAMES

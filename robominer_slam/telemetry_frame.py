@@ -8,7 +8,7 @@ from robominer_slam import geometry
 from robominer_slam.frame_result import FrameResult
 from robominer_slam.layout import WhiskerLayout
 from robominer_slam.mapping.keyframe_map import KeyframeMap
-from robominer_slam.publisher import full_covariance
+from robominer_slam.publisher import LEVEL_VARIANCE
 from robominer_slam.publishing.telemetry import Health, Telemetry, encode
 
 
@@ -22,6 +22,7 @@ def telemetry(
 ) -> bytes:
     """The message, at most 200 bytes; free whiskers have inclination zero, unusable ones NaN."""
     shape = (layout.rows, layout.cols)
+    x, y, yaw = result.covariance.diagonal().tolist()
     inclination = np.where(result.angles.valid, 0.0, np.nan)
     inclination[result.contacts.index] = result.contacts.inclination
     return encode(
@@ -30,7 +31,7 @@ def telemetry(
             stamp_ns=stamp_unix_ns,
             state=result.state,
             pose=geometry.to_vector7(result.T_map_base),
-            sigmas=np.sqrt(full_covariance(result.covariance).diagonal()),
+            sigmas=np.sqrt([x, y, *LEVEL_VARIANCE, yaw]),
             velocity=result.odometry.velocity,
             contacts=len(result.contacts.index),
             inclination=inclination.reshape(shape),

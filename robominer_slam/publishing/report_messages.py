@@ -18,6 +18,9 @@ from drivers.ros_messages import header, new, serialize, time_from_ns
 OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
 DIAGNOSTIC_ARRAY = "diagnostic_msgs/msg/DiagnosticArray"
 
+#: Zeros up to a multiple of four, by the remainder.
+_PADDING = (b"", bytes(3), bytes(2), bytes(1))
+
 
 class Level(IntEnum):
     """diagnostic_msgs/DiagnosticStatus: how bad it is."""
@@ -90,4 +93,9 @@ def _count(data: bytearray, sequence: Sized) -> None:
 
 
 def _add(data: bytearray, text: str) -> None:
-    data += cdr.string(text, len(data))
+    """What `cdr.string` would, with less copying."""
+    encoded = text.encode()
+    data += _PADDING[len(data) % 4]
+    data += cdr.UINT32.pack(len(encoded) + 1)
+    data += encoded
+    data.append(0)
