@@ -104,7 +104,8 @@ class Pipeline:
 
     def add(self, device: str, measurement: Measurement) -> list[FrameResult]:
         """Take a measurement of a device; returns the results of the frames that it releases."""
-        return self._process(self.reorder.add(device, measurement))
+        due = self.reorder.add(device, measurement)
+        return self._process(due) if due else []
 
     def finish(self) -> list[FrameResult]:
         """Process what still waits for its turn, at the end of the measurements."""

@@ -7,8 +7,7 @@ Without frames, measurements are released once they are older than the window.
 
 from __future__ import annotations
 
-import heapq
-from itertools import count
+from bisect import bisect_right
 
 from drivers.measurement import HallFrame, Measurement
 
@@ -28,8 +27,9 @@ class ReorderBuffer:
 
     def __init__(self, window_ns: int) -> None:
         self._window_ns = window_ns
-        self._heap: list[tuple[int, int, str, Measurement]] = []
-        self._order = count()
+        # What waits, in the order of its stamps: nearly all comes in order, and is put at the end.
+        self._stamps: list[int] = []
+        self._waiting: list[tuple[str, Measurement]] = []
         self._released_ns: int | None = None
         self.late = 0
         self.dropped = 0
@@ -42,23 +42,28 @@ class ReorderBuffer:
             if self._released_ns - stamp > MAX_LATE_NS:
                 self.dropped += 1
                 return []
-        heapq.heappush(self._heap, (stamp, next(self._order), device, measurement))
+        at = bisect_right(self._stamps, stamp)
+        self._stamps.insert(at, stamp)
+        self._waiting.insert(at, (device, measurement))
         if isinstance(measurement, HallFrame):
             return self._release(stamp)
         due = self._release(stamp - self._window_ns)
-        while len(self._heap) > MAX_WAITING:
-            heapq.heappop(self._heap)
-            self.dropped += 1
+        excess = len(self._stamps) - MAX_WAITING
+        if excess > 0:
+            del self._stamps[:excess], self._waiting[:excess]
+            self.dropped += excess
         return due
 
     def flush(self) -> list[tuple[str, Measurement]]:
         """Everything that still waits, in order."""
-        return self._release(max((entry[0] for entry in self._heap), default=0))
+        return self._release(self._stamps[-1]) if self._stamps else []
 
     def _release(self, until_ns: int) -> list[tuple[str, Measurement]]:
-        due = []
-        while self._heap and self._heap[0][0] <= until_ns:
-            stamp, _, device, measurement = heapq.heappop(self._heap)
-            self._released_ns = stamp if self._released_ns is None else max(stamp, self._released_ns)
-            due.append((device, measurement))
+        if not self._stamps or self._stamps[0] > until_ns:
+            return []
+        count = bisect_right(self._stamps, until_ns)
+        last_ns = self._stamps[count - 1]
+        self._released_ns = last_ns if self._released_ns is None else max(last_ns, self._released_ns)
+        due = self._waiting[:count]
+        del self._stamps[:count], self._waiting[:count]
         return due
