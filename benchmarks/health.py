@@ -74,7 +74,8 @@ def states(drive: Frames, fault: Fault | None = None, seed: int = 0) -> NDArray[
     found = []
     for k, event in enumerate(SensorFaults([fault] if fault else [], model.rest_mT, cols=8, seed=seed).apply(events)):
         angles = estimator.angles(event.field_mT, event.valid)
-        health.update(event.time_ns, event.field_mT, event.valid, angles.inclination, angles.azimuth, drive.position[k])
+        x, y = drive.position[k]
+        health.update(event.time_ns, event.field_mT, event.valid, angles.inclination, angles.azimuth, (x, y))
         found.append(health.state.copy())
     return np.array(found)
 

@@ -66,9 +66,9 @@ class FlowBend:
         settings = self._settings
         self.bend = None
         slight = valid & (inclination < math.radians(settings.flow_bend_deg))
-        who = np.flatnonzero(slight)
-        if len(who) < settings.flow_whiskers:
+        if np.count_nonzero(slight) < settings.flow_whiskers:
             return None
+        who = np.flatnonzero(slight)
         phi, a = inclination[who], azimuth[who]
         tilt = self._x_axis[:, who] * (phi * np.cos(a)) + self._y_axis[:, who] * (phi * np.sin(a))
         spread = math.radians(settings.flow_spread_deg)

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from robominer_slam.configuration.model import HealthSection
 from robominer_slam.layout import WhiskerLayout
+from robominer_slam.reading_window import ReadingWindow
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -56,12 +57,19 @@ class WhiskerState(IntEnum):
     SILENT = 9
 
 
+#: As numpy's own numbers: to compare an array with a member of an enumeration takes four times as long.
+_OK, _BENT = np.int8(WhiskerState.OK), np.int8(WhiskerState.BENT)
+_ZERO = np.zeros(1)
+
+
 class WhiskerHealth:
     """Keeps the last frames and the whiskers' states.
 
     Attributes:
         state: of each whisker, values of `WhiskerState`, shape (n,).
         since_ns: stamp of the frame that began it, shape (n,).
+        well: which whiskers can be believed, shape (n,).
+        watched: those, and bent and drifting ones, shape (n,).
     """
 
     def __init__(
@@ -79,37 +87,27 @@ class WhiskerHealth:
         n = layout.count
         self._limits, self._layout, self._folded = limits, layout, folded
         self.state: NDArray[np.int8] = np.zeros(n, dtype=np.int8)
+        self.well: BoolArray = np.ones(n, dtype=np.bool_)
+        self.watched: BoolArray = np.ones(n, dtype=np.bool_)
         self.since_ns: NDArray[np.int64] = np.zeros(n, dtype=np.int64)
         self._seen_ns: NDArray[np.int64] = np.zeros(n, dtype=np.int64)
         self._fitted = fitted & layout.present
         self._rest_square = np.maximum(np.square(rest_mT).sum(axis=1), 1.0)
+        self._least_square = limits.least_strength**2 * self._rest_square
+        self._greatest_square = limits.greatest_strength**2 * self._rest_square
         self._rest_direction = (rest_mT / np.sqrt(self._rest_square)[:, None]).T
-        # Twice the window, each frame written twice: the last frames in their order are always one slice. The
-        # whiskers are the last axis, which numpy goes along fastest.
-        twice = 2 * limits.window
-        self._field = np.zeros((twice, 3, n))
-        self._inclination = np.zeros((twice, n))
-        self._valid = np.zeros((twice, n), dtype=np.bool_)
-        self._position = np.zeros((twice, 2))
-        self._twice = [
-            part.reshape(2, limits.window, *part.shape[1:])
-            for part in (self._field, self._inclination, self._valid, self._position)
-        ]
-        self._frames = 0
-        self._well: BoolArray = np.ones(n, dtype=np.bool_)
+        self._window = ReadingWindow(limits.window, n, limits.noise)
         self._rest_state: NDArray[np.int8] = np.zeros(n, dtype=np.int8)
         self._against = np.zeros(n)
-        self._looked_at = np.zeros(2)
+        self._looked_at = (0.0, 0.0)
+        self._hole = ~layout.present
         alike = _cosines(layout.R_base_whisker[:, :, 2]) > COSINE_ALIKE
-        self._alike = (alike & layout.present & layout.present[:, None]).astype(np.float64)
+        # Whiskers that are alike to the same others are of one kind: sums are made once for each.
+        kinds, self._kind = np.unique(alike & layout.present & layout.present[:, None], axis=0, return_inverse=True)
+        self._of_kind = np.ascontiguousarray(kinds.T, dtype=np.float64)
         self._x_axis = np.ascontiguousarray(layout.R_base_whisker[:, :, 0].T)
         self._y_axis = np.ascontiguousarray(layout.R_base_whisker[:, :, 1].T)
         self._neighbours = _nearest(layout, alike)
-
-    @property
-    def well(self) -> BoolArray:
-        """Which whiskers can be believed, shape (n,)."""
-        return self._well
 
     def states(self) -> dict[int, tuple[WhiskerState, int]]:
         """Whiskers that are not well: index to state and the stamp at which it was found, ns."""
@@ -127,7 +125,7 @@ class WhiskerHealth:
         valid: BoolArray,
         inclination: FloatArray,
         azimuth: FloatArray,
-        position: FloatArray,
+        position: tuple[float, float],
     ) -> BoolArray:
         """Take a frame.
 
@@ -136,119 +134,117 @@ class WhiskerHealth:
             field_mT: shape (n, 3), mT, as read.
             valid: as the device says, shape (n,).
             inclination, azimuth: of the rods as calibrated, shape (n,), rad.
-            position: of base_link in odom, x and y, shape (2,), m.
+            position: of base_link in odom, x and y, m.
 
         Returns:
             Which whiskers can be believed, shape (n,).
         """
-        slot = self._frames % self._limits.window
-        for part, value in zip(self._twice, (field_mT.T, inclination, valid, position), strict=True):
-            part[:, slot] = value
-        self._frames += 1
-        if self._frames % self._limits.every == 0:
+        self._window.add(field_mT, inclination, valid, position)
+        if self._window.frames % self._limits.every == 0:
+            self._window.take_in()
             self._look(stamp_ns, azimuth)
         return self.well
 
     def _look(self, stamp_ns: int, azimuth: FloatArray) -> None:
         """Find the faults that there are now; the worst of each whisker counts."""
-        limits = self._limits
+        limits, window = self._limits, self._window
         found = self._rest_state.copy()
-        end = (self._frames - 1) % limits.window + limits.window + 1
-        if self._frames >= limits.window:
-            last = slice(end - limits.window, end)
-            self._from_window(found, self._field[last], self._inclination[last], self._position[last], azimuth)
-        few = slice(end - limits.dead_frames, end)
-        if self._frames >= limits.stuck_frames:
-            same = self._field[end - limits.stuck_frames : end - 1] == self._field[end - 1]
-            found[_all_of_both(same)] = WhiskerState.STUCK
-        if self._frames >= limits.dead_frames:
-            found[_all_of_both(self._field[few] == 0.0)] = WhiskerState.DEAD
-            found[~np.logical_or.reduce(self._valid[few])] = WhiskerState.SILENT
-        found[~self._layout.present] = WhiskerState.OK
-        bad = found != WhiskerState.OK
+        if window.frames >= limits.window:
+            self._from_window(found, azimuth)
+        field, valid = window.field_mT, window.valid
+        if window.frames >= limits.stuck_frames:
+            _mark_all(found, WhiskerState.STUCK, field[-limits.stuck_frames : -1], field[-1])
+        if window.frames >= limits.dead_frames:
+            _mark_all(found, WhiskerState.DEAD, field[-limits.dead_frames :], _ZERO)
+            if np.count_nonzero(valid[-1]) < len(found):
+                found[~np.logical_or.reduce(valid[-limits.dead_frames :])] = WhiskerState.SILENT
+        found[self._hole] = WhiskerState.OK
+        if np.count_nonzero(found) or np.count_nonzero(self.state):
+            self._change(stamp_ns, found)
+
+    def _change(self, stamp_ns: int, found: NDArray[np.int8]) -> None:
+        bad = found != _OK
         self._seen_ns[bad] = stamp_ns
         changed = bad & (found != self.state)
-        changed |= ~bad & (self.state != WhiskerState.OK) & (stamp_ns - self._seen_ns > limits.recovery * 1e9)
+        changed |= ~bad & ~self.well & (stamp_ns - self._seen_ns > self._limits.recovery * 1e9)
         self.since_ns[changed] = stamp_ns
         self.state[changed] = found[changed]
-        self._well = self.state == WhiskerState.OK
+        self.well = self.state == _OK
+        self.watched = self.state <= _BENT
 
-    def _from_window(
-        self,
-        found: NDArray[np.int8],
-        field: FloatArray,
-        inclination: FloatArray,
-        position: FloatArray,
-        azimuth: FloatArray,
-    ) -> None:
-        """Faults that take a full window, into `found`; arrays of its frames, oldest first, whiskers last."""
-        limits, fitted = self._limits, self._fitted
-        moved = math.dist(position[-1], position[0])
-        low = np.minimum.reduce(inclination)
-        idle = fitted & (np.maximum.reduce(inclination) < math.radians(limits.idle_deg))
-        if moved >= limits.moved and idle.any():
-            found[idle & self._neighbours_touch(low)] = WhiskerState.BROKEN
-        total = np.add.reduce(field[limits.window // 2 :])
-        mean = total / (limits.window - limits.window // 2)
+    def _from_window(self, found: NDArray[np.int8], azimuth: FloatArray) -> None:
+        """Faults that take a full window, into `found`."""
+        limits, fitted, window = self._limits, self._fitted, self._window
+        low = np.minimum.reduce(window.inclination)
+        if window.way >= limits.moved:
+            idle = fitted & (np.maximum.reduce(window.inclination) < math.radians(limits.idle_deg))
+            self._find_broken(found, np.flatnonzero(idle), low)
+        half = window.field_mT[limits.window // 2 :]
+        mean = np.add.reduce(half) / len(half)
         square = np.add.reduce(mean * mean)
-        weak = square < limits.least_strength**2 * self._rest_square
-        found[fitted & (weak | (square > limits.greatest_strength**2 * self._rest_square))] = WhiskerState.BROKEN
+        weak = square < self._least_square
+        found[fitted & (weak | (square > self._greatest_square))] = WhiskerState.BROKEN
         turned = np.zeros_like(weak)
         if not self._folded:
             along = np.add.reduce(mean * self._rest_direction)
             turned = ~weak & (along < math.cos(math.radians(limits.greatest_turn_deg)) * np.sqrt(square))
-        against = self._bends_against(position[-1], azimuth, low, turned)
+        against = self._bends_against(azimuth, low, turned)
         found[fitted & (turned | against)] = WhiskerState.FLIPPED
-        first = field[1:] - field[:-1]
-        second = first[1:] - first[:-1]
-        # The median of |second difference| of white noise is 0.6745 sqrt(6) sigma; more than half above: noisy.
-        high = np.abs(second, out=second) > 0.6745 * math.sqrt(6.0) * limits.noise
-        noisy = 2 * np.add.reduce(high.reshape(-1, high.shape[-1]), dtype=np.intp) > 3 * len(second)
+        # More than half of the second differences are above their median if that were noise.
+        noisy = 2 * np.add.reduce(window.rough, dtype=np.intp) > 3 * len(window.rough)
+        count = np.count_nonzero(noisy)
         # All at once is the ground or a knock, not the sensors.
-        if np.count_nonzero(noisy) and 3 * np.count_nonzero(noisy) <= np.count_nonzero(self._layout.present):
+        if count and 3 * count <= np.count_nonzero(self._layout.present):
             found[noisy] = WhiskerState.NOISY
-        if field.max() >= limits.saturation or field.min() <= -limits.saturation:
-            at_end = (np.abs(field) >= limits.saturation).any(axis=1)
+        # What is at the end for more than half of the window is so once in its second half.
+        if half.max() >= limits.saturation or half.min() <= -limits.saturation:
+            at_end = (np.abs(window.field_mT) >= limits.saturation).any(axis=1)
             found[2 * at_end.sum(axis=0) > limits.window] = WhiskerState.SATURATED
 
-    def _neighbours_touch(self, low: FloatArray) -> BoolArray:
-        """Where all neighbours that are well, of enough, have been bent all the time; `low`: least inclination."""
-        touching = low > math.radians(self._limits.bent_neighbours_deg)
-        asked = (self._neighbours >= 0) & (self.state == WhiskerState.OK)[self._neighbours]
-        enough: BoolArray = asked.sum(axis=1) >= FEWEST_NEIGHBOURS
-        all_touch: BoolArray = (touching[self._neighbours] | ~asked).all(axis=1)
-        return enough & all_touch
+    def _find_broken(self, found: NDArray[np.int8], idle: NDArray[np.intp], low: FloatArray) -> None:
+        """Idle whiskers all of whose neighbours that are well, of enough, have been bent all the time.
 
-    def _bends_against(
-        self, position: FloatArray, azimuth: FloatArray, low: FloatArray, turned: BoolArray
-    ) -> BoolArray:
+        `low` is the least inclination of each whisker.
+        """
+        if not len(idle):
+            return
+        touching = low > math.radians(self._limits.bent_neighbours_deg)
+        neighbours = self._neighbours[idle]
+        asked = (neighbours >= 0) & self.well[neighbours]
+        enough = asked.sum(axis=1) >= FEWEST_NEIGHBOURS
+        found[idle[enough & (touching[neighbours] | ~asked).all(axis=1)]] = WhiskerState.BROKEN
+
+    def _bends_against(self, azimuth: FloatArray, low: FloatArray, turned: BoolArray) -> BoolArray:
         """Rods that have bent against all others of their kind for too long a way.
 
         A field that has `turned` too far from rest says nothing of where its rod bends to.
         """
-        limits = self._limits
+        limits, position = self._limits, self._window.position
         step = math.dist(position, self._looked_at)
-        self._looked_at = position.copy()
+        self._looked_at = position
         # A jump of odom is no way that was driven.
         step = step if step < 10.0 * limits.moved else 0.0
         own = self._x_axis * np.cos(azimuth) + self._y_axis * np.sin(azimuth)
         bent = low > math.radians(limits.idle_deg)
-        asked = (bent & (self.state == WhiskerState.OK)).astype(np.float64)
-        total = (own * asked) @ self._alike
+        asked = (bent & self.well).astype(np.float64)
+        total = ((own * asked) @ self._of_kind).take(self._kind, axis=1)
+        count = (asked @ self._of_kind)[self._kind]
         length = np.sqrt(np.add.reduce(total * total))
-        count = asked @ self._alike
         along = np.add.reduce(own * total)
         coherent = bent & ~turned & (length > COHERENT * count) & (count >= FEWEST_NEIGHBOURS)
-        self._against[coherent & (along > 0.0)] = 0.0
+        if np.count_nonzero(self._against):
+            self._against[coherent & (along > 0.0)] = 0.0
         self._against[coherent & (along < AGAINST * length)] += step
         against: BoolArray = self._against > limits.against
         return against
 
 
-def _all_of_both(flags: BoolArray) -> BoolArray:
-    """Whether all are true along the first two axes of shape (m, 3, n)."""
-    result: BoolArray = np.logical_and.reduce(flags.reshape(-1, flags.shape[-1]))
-    return result
+def _mark_all(found: NDArray[np.int8], state: WhiskerState, fields: FloatArray, value: FloatArray) -> None:
+    """Mark whiskers whose fields, shape (m, 3, n), are all equal to `value`, shape (3, n) or (1,)."""
+    # Nearly always the oldest of them tells that it is none.
+    if np.count_nonzero(np.logical_and.reduce(fields[0] == value)):
+        same = fields == value
+        found[np.logical_and.reduce(same.reshape(-1, same.shape[-1]))] = state
 
 
 def _cosines(axis: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ from drivers.measurement import HallFrame
 from robominer_slam.estimation.odometry_state import OdometryState
 from robominer_slam.flow_bend import FlowBend
 from robominer_slam.rest_tracking import RestTracker
-from robominer_slam.whisker_health import WhiskerHealth, WhiskerState
+from robominer_slam.whisker_health import WhiskerHealth
 
 BoolArray = NDArray[np.bool_]
 
@@ -46,11 +46,11 @@ class WhiskerMonitor:
             frame.valid.reshape(-1),
             phi,
             azimuth,
-            np.array([odometry.x, odometry.y]),
+            (odometry.x, odometry.y),
         )
         well = well & angles.valid
         # Bent and drifting whiskers are watched on: that is how they come back.
-        watched = angles.valid & (self.health.state <= WhiskerState.BENT)
+        watched = angles.valid & self.health.watched
         shift = self.rest.update(stamp, watched, phi, azimuth, (odometry.x, odometry.y, odometry.yaw))
         if shift is not None:
             estimator.shift_rest(shift)

@@ -58,7 +58,7 @@ def states_of(drive, *faults, seed=0, change=None):
     for k, event in enumerate(SensorFaults(faults, model.rest_mT, cols=8, seed=seed).apply(events)):
         field = event.field_mT if change is None else change(k / 25.0, event.field_mT.copy())
         angles = estimator.angles(field, event.valid)
-        health.update(event.time_ns, field, event.valid, angles.inclination, angles.azimuth, positions[k])
+        health.update(event.time_ns, field, event.valid, angles.inclination, angles.azimuth, tuple(positions[k]))
         states.append(health.state.copy())
     return np.array(states)
 
