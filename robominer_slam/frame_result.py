@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +18,8 @@ FloatArray = NDArray[np.float64]
 LocalizationState = Literal["lost", "relocalizing", "dead_reckoning", "tracking"]
 
 
-@dataclass(frozen=True, slots=True)
-class FrameResult:
-    """The robot at the time of one whisker frame.
+class FrameResult(NamedTuple):
+    """The robot at the time of one whisker frame; a tuple, since it is made with every frame.
 
     Attributes:
         stamp_ns: time of the frame's first sensor, in the measurements' clock.

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from robominer_slam import geometry
 from robominer_slam.estimation.odometry_state import OdometryState
+from robominer_slam.float_array import of_floats
 from robominer_slam.slam.keyframe import BackendResult, Keyframe
 
 FloatArray = NDArray[np.float64]
@@ -25,7 +26,9 @@ class MapPose:
         self.T_map_odom = np.eye(4)
         self._first_covariance = np.zeros((3, 3))
         self._last: BackendResult | None = None
-        self._odometry_at_last: FloatArray | None = None
+        # Of the last result: its covariance in map, and odometry's variances at its keyframe.
+        self._covariance_at_last = np.zeros((3, 3))
+        self._odometry_at_last: list[float] | None = None
         self._odometry_of_keyframe: dict[int, FloatArray] = {}
 
     def begin(self) -> None:
@@ -47,7 +50,8 @@ class MapPose:
     def take(self, result: BackendResult) -> None:
         """A result takes effect; the correction itself is taken by `correct`, if it is to count."""
         self._last = result
-        self._odometry_at_last = self._odometry_of_keyframe.pop(result.keyframe.id)
+        self._odometry_at_last = self._odometry_of_keyframe.pop(result.keyframe.id).diagonal().tolist()
+        self._covariance_at_last = self._first_covariance + result.covariance
 
     def correct(self, result: BackendResult) -> None:
         """Take a result's correction."""
@@ -68,9 +72,9 @@ class MapPose:
             R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
             covariance: FloatArray = R @ odometry.covariance @ R.T
             return covariance
-        grown = (odometry.covariance - self._odometry_at_last).diagonal().tolist()
-        x, y, yaw = (max(variance, 0.0) for variance in grown)
+        now, then = odometry.covariance.diagonal().tolist(), self._odometry_at_last
+        x, y, yaw = (max(variance - before, 0.0) for variance, before in zip(now, then, strict=True))
         xy = c * s * (x - y)
-        turned = np.array([[c * c * x + s * s * y, xy, 0.0], [xy, s * s * x + c * c * y, 0.0], [0.0, 0.0, yaw]])
-        covariance = self._first_covariance + self._last.covariance + turned
+        turned = of_floats([c * c * x + s * s * y, xy, 0.0, xy, s * s * x + c * c * y, 0.0, 0.0, 0.0, yaw])
+        covariance = self._covariance_at_last + turned.reshape(3, 3)
         return covariance
