@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterable, Mapping
+from functools import lru_cache
 from types import TracebackType
 from typing import TypeAlias
 
@@ -33,6 +34,9 @@ __all__ = [
 log = logging.getLogger(__name__)
 
 DEFAULT_TIMEOUT_S = 5.0
+
+#: Encodings from their names, each read once.
+_encoding = lru_cache(maxsize=64)(zenoh.Encoding)
 
 _Declared: TypeAlias = "zenoh.Subscriber[None] | ext.AdvancedSubscriber[None] | zenoh.Queryable[None]"
 
@@ -123,7 +127,7 @@ class ZenohBus:
             ros: whether it goes to ROS, too, where that is set up.
         """
         chosen = encoding_of(key) if encoding is None else encoding
-        self._publisher(key, qos).put(payload, encoding=chosen, attachment=attachment)
+        self._publisher(key, qos).put(payload, encoding=_encoding(chosen), attachment=attachment)
         if self._ros is not None and ros:
             self._ros.put(key, payload)
 
@@ -265,6 +269,9 @@ class ZenohBus:
         return [peer for peer in peers if peer.name is None or peer.name in self._commanders]
 
     def _publisher(self, key: str, qos: Qos | None) -> Publisher:
+        publisher = self._publishers.get(key)
+        if publisher is not None:
+            return publisher
         with self._lock:
             publisher = self._publishers.get(key)
             if publisher is None:
