@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import logging
 import threading
 from dataclasses import replace
@@ -80,7 +81,18 @@ def serve(configuration: Configuration, reload: Reload, stop: threading.Event) -
             else TappedSource(SerialReader(device_settings(configuration)), bus, WallClock())
         )
         stack.enter_context(source)
-        Daemon(configuration, array, source, bus, store, supervision, known).run(stop)
+        daemon = Daemon(configuration, array, source, bus, store, supervision, known)
+        keep_what_is_there()
+        daemon.run(stop)
+
+
+def keep_what_is_there() -> None:
+    """Spare the garbage collector all that lives as long as the process.
+
+    A full collection would stop the loop for as long as five frames take, every few minutes.
+    """
+    gc.collect()
+    gc.freeze()
 
 
 def map_to_start_with(

@@ -39,6 +39,7 @@ from robominer_slam.publisher import Publisher
 from robominer_slam.publishing.robot_settings import robot_settings
 from robominer_slam.publishing.zenoh_session import ZenohBus
 from robominer_slam.replay import prepare
+from robominer_slam.service import keep_what_is_there
 from robominer_slam.slam.backend_runner import SynchronousRunner
 from robominer_slam.slam.composite_scan import CompositeScan
 from robominer_slam.slam.robust import RobustBackend
@@ -205,6 +206,7 @@ def main() -> None:
                 monotonic_ns=lambda: source.now_ns,
                 execution="synchronous",
             )
+            keep_what_is_there()
             stages.begin("main loop")
             running.run(stop)
             stages.begin("end")
