@@ -72,8 +72,9 @@ class MapPose:
             R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
             covariance: FloatArray = R @ odometry.covariance @ R.T
             return covariance
-        now, then = odometry.covariance.diagonal().tolist(), self._odometry_at_last
-        x, y, yaw = (max(variance - before, 0.0) for variance, before in zip(now, then, strict=True))
+        x_then, y_then, yaw_then = self._odometry_at_last
+        x, y, yaw = odometry.covariance.diagonal().tolist()
+        x, y, yaw = max(x - x_then, 0.0), max(y - y_then, 0.0), max(yaw - yaw_then, 0.0)
         xy = c * s * (x - y)
         turned = of_floats([c * c * x + s * s * y, xy, 0.0, xy, s * s * x + c * c * y, 0.0, 0.0, 0.0, yaw])
         covariance = self._covariance_at_last + turned.reshape(3, 3)

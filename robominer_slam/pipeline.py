@@ -188,7 +188,7 @@ class Pipeline:
             self._feels.add_contacts(stamp, contacts)
             odometry = self._dead_reckoning.state_at(stamp)
         floor = self._points_down[contacts.index]
-        odometry = self._matched(stamp, odometry, contacts.points[floor])
+        odometry = self._matched(stamp, odometry, contacts.points.compress(floor, axis=0))
         T_odom_base = planar_pose(odometry)
         backend_results = self.runner.due(stamp) if self.runner is not None else []
         for result in backend_results:
@@ -201,7 +201,7 @@ class Pipeline:
             odometry=odometry,
             T_odom_base=T_odom_base,
             T_map_odom=T_map_odom,
-            T_map_base=T_map_odom @ T_odom_base,
+            T_map_base=T_map_odom.dot(T_odom_base),
             covariance=self._map_pose.covariance(odometry) if self.localised else UNKNOWN_COVARIANCE,
             angles=angles,
             whisker_states=self.monitor.health.states(),

@@ -102,8 +102,10 @@ class WhiskerHealth:
         self._looked_at = (0.0, 0.0)
         self._hole = ~layout.present
         alike = _cosines(layout.R_base_whisker[:, :, 2]) > COSINE_ALIKE
-        # Whiskers that are alike to the same others are of one kind: sums are made once for each.
-        kinds, self._kind = np.unique(alike & layout.present & layout.present[:, None], axis=0, return_inverse=True)
+        # Whiskers that are alike to the same others are of one kind: sums are made once for each. The sum of a single
+        # kind is that of all.
+        kinds, kind = np.unique(alike & layout.present & layout.present[:, None], axis=0, return_inverse=True)
+        self._kind = kind.reshape(-1) if len(kinds) > 1 else np.zeros(1, dtype=np.intp)
         self._of_kind = np.ascontiguousarray(kinds.T, dtype=np.float64)
         self._x_axis = np.ascontiguousarray(layout.R_base_whisker[:, :, 0].T)
         self._y_axis = np.ascontiguousarray(layout.R_base_whisker[:, :, 1].T)
