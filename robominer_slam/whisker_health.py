@@ -178,8 +178,9 @@ class WhiskerHealth:
         """Faults that take a full window, into `found`."""
         limits, fitted, window = self._limits, self._fitted, self._window
         low = np.minimum.reduce(window.inclination)
-        if window.way >= limits.moved:
-            idle = fitted & (np.maximum.reduce(window.inclination) < math.radians(limits.idle_deg))
+        rested = fitted & (low < math.radians(limits.idle_deg))
+        if window.way >= limits.moved and np.count_nonzero(rested):
+            idle = rested & (np.maximum.reduce(window.inclination) < math.radians(limits.idle_deg))
             self._find_broken(found, np.flatnonzero(idle), low)
         half = window.field_mT[limits.window // 2 :]
         mean = np.add.reduce(half) / len(half)
@@ -230,13 +231,15 @@ class WhiskerHealth:
         bent = low > math.radians(limits.idle_deg)
         asked = (bent & self.well).astype(np.float64)
         total = ((own * asked) @ self._of_kind).take(self._kind, axis=1)
-        count = (asked @ self._of_kind)[self._kind]
         length = np.sqrt(np.add.reduce(total * total))
         along = np.add.reduce(own * total)
+        contrary = bent & (along < AGAINST * length)
+        if not np.count_nonzero(contrary) and not np.count_nonzero(self._against):
+            return np.zeros_like(bent)
+        count = (asked @ self._of_kind)[self._kind]
         coherent = bent & ~turned & (length > COHERENT * count) & (count >= FEWEST_NEIGHBOURS)
-        if np.count_nonzero(self._against):
-            self._against[coherent & (along > 0.0)] = 0.0
-        self._against[coherent & (along < AGAINST * length)] += step
+        self._against[coherent & (along > 0.0)] = 0.0
+        self._against[coherent & contrary] += step
         against: BoolArray = self._against > limits.against
         return against
 
