@@ -40,6 +40,7 @@ from robominer_slam.geometry_rotations import (
     matrix_from_rpy,
     matrix_to_quaternion,
     quaternion_log,
+    quaternion_of,
     quaternion_to_matrix,
     rpy_of,
     so3_exp,
@@ -112,6 +113,9 @@ def pose_matrix(xyz: ArrayLike, quaternion: ArrayLike) -> FloatArray:
 def to_vector7(T: ArrayLike) -> FloatArray:
     """x, y, z, qx, qy, qz, qw (..., 7) of pose matrices (..., 4, 4)."""
     m = np.asarray(T, dtype=np.float64)
+    if m.ndim == 2:
+        rows = m.tolist()
+        return np.array((rows[0][3], rows[1][3], rows[2][3], *quaternion_of(*rows[:3])))
     vector = np.empty((*m.shape[:-2], 7))
     vector[..., :3] = m[..., :3, 3]
     vector[..., 3:] = matrix_to_quaternion(m[..., :3, :3])

@@ -25,6 +25,7 @@ from calibration.angle_estimator import AngleEstimator
 from drivers.device import Device, DeviceStatus
 from drivers.measurement import HallFrame, ImuSample, Measurement, ScrewAngles
 from drivers.recording_reader import Recording
+from drivers.serial_reader import TICK_NS
 from drivers.settings import DeviceSettings
 from robominer_slam import daemon, pipeline
 from robominer_slam.calibrated_array import CalibratedArray
@@ -118,7 +119,8 @@ class RecordedDevices:
     def _measurements(self, recording: Recording, length_ns: int) -> Iterator[tuple[str, Measurement]]:
         for device in self._devices:
             device.opened(device.settings.port, 0)
-        for now_ns in range(0, LEARNING_NS, 20_000_000):
+        asked_ns = 0
+        for now_ns in range(0, LEARNING_NS, TICK_NS):
             yield from self._answers(now_ns)
         start_ns: int | None = None
         for _, measurement in recording:
@@ -132,7 +134,9 @@ class RecordedDevices:
                 data = self._boards[device.settings.name].packet(measurement, time_us)
                 if data is not None:
                     yield from self._received(device, data)
-            yield from self._answers(self.now_ns)
+            if self.now_ns - asked_ns >= TICK_NS:
+                asked_ns = self.now_ns
+                yield from self._answers(self.now_ns)
 
     @property
     def driven_s(self) -> float:
