@@ -74,12 +74,11 @@ def errors(
     result = np.empty((5, *shape))
     for k, truth in enumerate(rod_direction(hinge)):
         a = estimator.angles(field[k], everyone, R[k] if earth else None)
-        sine = np.sin(a.inclination)
-        found = np.stack([sine * np.cos(a.azimuth), sine * np.sin(a.azimuth), np.cos(a.inclination)], axis=-1)
-        chord = np.linalg.norm(found - truth, axis=-1)
+        sigma = estimator.sigma(a.inclination)
+        chord = np.linalg.norm(a.direction.T - truth, axis=-1)
         error = 2.0 * np.arcsin(np.clip(chord / 2.0, 0.0, 1.0))
         result[:, k] = (
-            np.rad2deg(inclination[k]), np.rad2deg(error), error / a.sigma, 1e3 * chord * layout.length, a.valid,
+            np.rad2deg(inclination[k]), np.rad2deg(error), error / sigma, 1e3 * chord * layout.length, a.valid,
         )  # fmt: skip
     return result.reshape(5, -1)
 

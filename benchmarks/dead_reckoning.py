@@ -80,7 +80,7 @@ def load(path: Path) -> Drive:
     for _, measurement in due + reorder.flush():
         if isinstance(measurement, HallFrame):
             found = angles.angles(measurement.field_mT, measurement.valid)
-            contacts = model.contacts(found.inclination, found.azimuth, found.valid)
+            contacts = model.contacts(found, found.valid)
             events.append(Frame(measurement.stamp_ns, measurement.sensor_period_ns, contacts))
         else:
             events.append(measurement)

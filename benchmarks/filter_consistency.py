@@ -56,7 +56,7 @@ SLIPPING, SLIP_EVERY, SLIP_FACTOR = 50, 250, 2.0
 SIDEWAYS_SIGMA, TIPS = 0.005, (0.25, -0.25)
 #: The direction that counts as ahead swings by so much, rad, so fast, rad/s.
 DIRECTION_SWING, DIRECTION_RATE = 0.3, 0.5
-NO_CONTACTS = Contacts(np.zeros((0, 3)), np.zeros(0, dtype=np.intp), np.zeros(0), np.zeros(0))
+NO_CONTACTS = Contacts(np.zeros((0, 3)), np.zeros(0, dtype=np.intp), np.zeros(0), np.zeros(0), np.zeros((3, 0)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -78,7 +78,7 @@ def load(path: Path, seeds: list[int]) -> Drive:
         if isinstance(measurement, HallFrame):
             found = angles.angles(measurement.field_mT, measurement.valid)
             stamps.append(measurement.stamp_ns)
-            contacts.append(model.contacts(found.inclination, found.azimuth, found.valid).points)
+            contacts.append(model.contacts(found, found.valid).points)
     stamps_ns = np.array(stamps, dtype=np.int64)
     truths = [truth for _, truth in Recording(path).ground_truth()]
     truth = Trajectory(

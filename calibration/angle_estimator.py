@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +17,10 @@ RANGE_MARGIN = np.deg2rad(3.0)
 MOST = np.deg2rad(85.0)
 #: A change of what the neighbours add that is not worth another evaluation, mT: 0.06 deg.
 NEGLIGIBLE_MT = 0.02
-#: A rod's direction that has changed by less adds what it added: half a reading's noise, 0.0005 mT to a neighbour. (At
-#: four times the noise the lag is seen: without a gyro the heading drifts a tenth faster.)
-SAME_DIRECTION = 0.005
+#: What rods add to their neighbours is brought up to date for one of so many blocks of rods per reading, in turn.
+BLOCKS = 4
+#: A rod whose direction has changed by more is not waited for: six times a reading's noise, 0.005 mT to a neighbour.
+QUICK = 0.05
 #: Evaluations at most: the second one's error is a hundredth of the neighbours' field.
 ITERATIONS = 2
 #: Step of the difference quotients at rest, mT: 0.3 deg, within which the field is as good as linear.
@@ -32,20 +34,20 @@ class WhiskerAngles:
     Attributes:
         inclination: from the whisker's z axis, rad.
         azimuth: from the whisker's x axis, rad; means little near zero inclination.
-        sigma: one-sigma error of the rod's direction, rad.
+        direction: of the rod in its whisker's axes, unit vectors, shape (3, n).
         valid: False for a dead, uncalibrated or out-of-range whisker; its angles must not be used.
     """
 
     inclination: FloatArray
     azimuth: FloatArray
-    sigma: FloatArray
+    direction: FloatArray
     valid: NDArray[np.bool_]
 
 
 class AngleEstimator:
     """Applies a calibration to readings; keeps the rest offsets of a re-zeroing.
 
-    What the neighbours' magnets add is taken from the angles of the last call, which differ little from frame to
+    What the neighbours' magnets add is taken from the angles of the last calls, which differ little from frame to
     frame; where they differ more, the readings are evaluated again.
     """
 
@@ -66,12 +68,14 @@ class AngleEstimator:
         self._direction_only = model.representation == "Direction"
         # Directions alone do not tell how strong the neighbours are beside the whisker's own magnet.
         self._neighbours = None if self._direction_only else model.neighbours
-        self._added_mT = np.zeros_like(model.rest_mT)
-        self._moved = np.empty_like(model.rest_mT)
-        #: Of each rod's change of direction, x, y, z, what it adds to all sensors, shape (n, 3, 3 n); and the changes
-        #: of direction that are in `_added_mT`.
+        #: Of each rod's change of direction, x, y, z, what it adds to all sensors, shape (n, 3, 3 n); the same by
+        #: blocks of rods, (3 n, 3 of them); and the directions that are in `_added_mT`.
         self._adds = None if self._neighbours is None else _by_source(self._neighbours)
-        self._counted = np.zeros_like(model.rest_mT)
+        self._blocks = [] if self._adds is None else _blocks(self._adds)
+        self._turn = 0
+        self._added_mT = np.zeros_like(model.rest_mT)
+        self._counted = np.zeros((3, self.count))
+        self._counted[2] = 1.0
         self._earth_mT = None if self._direction_only or model.base_to_sensor is None else earth_mT
         self.out_of_range = 0
 
@@ -111,44 +115,46 @@ class AngleEstimator:
         if self._adds is None:
             tilt = self._evaluator.tilt(field)
             inclination = np.sqrt(tilt[0] * tilt[0] + tilt[1] * tilt[1])
+            direction = _directions(tilt, inclination, usable)
         else:
-            tilt, inclination = self._without_neighbours(field, usable, self._adds)
+            tilt, inclination, direction = self._without_neighbours(field, usable, self._adds)
         in_range = inclination <= self._largest
         well = usable & in_range
         self.out_of_range += int(np.count_nonzero(usable)) - int(np.count_nonzero(well))
         azimuth = np.arctan2(tilt[1], tilt[0])
-        return WhiskerAngles(inclination, azimuth, self._sigma(inclination), well)
+        return WhiskerAngles(inclination, azimuth, direction, well)
 
     def _without_neighbours(
         self, field: FloatArray, usable: NDArray[np.bool_], adds: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Tilts, shape (2, n), and inclinations, shape (n,), rad, with the neighbours' magnets taken out."""
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Tilts (2, n) and inclinations (n,), rad, with the neighbours' magnets taken out, and directions (3, n)."""
         for _ in range(ITERATIONS):
             tilt = self._evaluator.tilt(field - self._added_mT)
             inclination = np.sqrt(tilt[0] * tilt[0] + tilt[1] * tilt[1])
-            # A rod's direction less its rest direction; what a dead sensor's rod does, nobody knows.
-            bent = np.minimum(inclination, MOST) * usable
-            moved = self._moved
-            moved[:, :2] = (tilt * (np.sin(bent) / np.maximum(inclination, 1e-9))).T
-            moved[:, 2] = np.cos(bent) - 1.0
-            # Rods change little from frame to frame, and most of them nothing: what the others add is known.
-            step = moved - self._counted
-            (changed,) = (np.maximum.reduce(np.abs(step), axis=1) > SAME_DIRECTION).nonzero()
-            if not len(changed):
-                break
-            if 4 * len(changed) > len(step):
-                # To pick so many rows out takes longer than to go through all.
-                more = step.reshape(-1).dot(adds.reshape(step.size, -1))
-                self._counted[:] = moved
+            direction = _directions(tilt, inclination, usable)
+            # Rods change little from frame to frame: most of what they add to each other may wait for its turn.
+            step = direction - self._counted
+            (quick,) = (np.maximum.reduce(np.abs(step)) > QUICK).nonzero()
+            if 4 * len(quick) > step.shape[1]:
+                # To pick so many rods out takes longer than to go through all.
+                more = step.T.reshape(-1).dot(adds.reshape(step.size, -1))
+                self._counted[:] = direction
             else:
-                more = step[changed].reshape(-1).dot(adds[changed].reshape(3 * len(changed), -1))
-                self._counted[changed] = moved[changed]
-            self._added_mT = self._added_mT + more.reshape(-1, 3)
+                rods, adding = self._blocks[self._turn]
+                self._turn = (self._turn + 1) % BLOCKS
+                more = adding.dot(step[:, rods].reshape(-1))
+                self._counted[:, rods] = direction[:, rods]
+                if len(quick):
+                    step = direction[:, quick] - self._counted[:, quick]
+                    more += step.T.reshape(-1).dot(adds[quick].reshape(3 * len(quick), -1))
+                    self._counted[:, quick] = direction[:, quick]
+            self._added_mT += more.reshape(-1, 3)
             if np.maximum.reduce(np.abs(more)) < NEGLIGIBLE_MT:
                 break
-        return tilt, inclination
+        return tilt, inclination, direction
 
-    def _sigma(self, inclination: FloatArray) -> FloatArray:
+    def sigma(self, inclination: FloatArray) -> FloatArray:
+        """One-sigma errors of the rods' directions at inclinations, shape (n,) each, rad."""
         if self._variance is None:
             return self._model.sigma
         square = np.minimum(inclination, MOST)
@@ -181,3 +187,20 @@ def _by_source(neighbours: FloatArray) -> FloatArray:
     """The neighbours' matrix, shape (3 n, 3 n), with the rods that add first: shape (n, 3, 3 n)."""
     n = len(neighbours) // 3
     return np.ascontiguousarray(neighbours.T).reshape(n, 3, 3 * n)
+
+
+def _blocks(adds: FloatArray) -> list[tuple[slice, FloatArray]]:
+    """Rods in blocks that follow each other, and what a block's directions (x of all, y of all, z) add, (3 n, 3 k)."""
+    ends = [len(adds) * k // BLOCKS for k in range(BLOCKS + 1)]
+    rods = [slice(begin, end) for begin, end in pairwise(ends)]
+    return [(one, np.ascontiguousarray(adds[one].transpose(2, 1, 0)).reshape(adds.shape[2], -1)) for one in rods]
+
+
+def _directions(tilt: FloatArray, inclination: FloatArray, usable: NDArray[np.bool_]) -> FloatArray:
+    """Directions of rods, shape (3, n), from tilts, shape (2, n), of these inclinations."""
+    # What a dead sensor's rod does, nobody knows: it counts as at rest.
+    bent = np.minimum(inclination, MOST) * usable
+    direction = np.empty((3, len(bent)))
+    np.multiply(tilt, np.sin(bent) / np.maximum(inclination, 1e-9), out=direction[:2])
+    np.cos(bent, out=direction[2])
+    return direction

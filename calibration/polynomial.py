@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from itertools import combinations_with_replacement
+from itertools import combinations_with_replacement, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,11 +133,10 @@ class PolynomialEvaluator:
         strength = np.maximum(np.sqrt(np.square(model.rest_mT).sum(axis=-1)), 1.0)
         self._inverse_strength = 1.0 / strength
         self._coefficients = np.ascontiguousarray(model.coefficients.transpose(2, 1, 0))
-        # Every monomial is the product of two of at most half the degree (rounded up), which are few: rows of a table.
-        # A product of many rows at once costs less than numpy's calls for one degree after the other.
-        self._half = _rows(model.degree)
-        self._first, self._second = _factors(model.degree)
-        self._table = np.ones((len(_exponents((model.degree + 1) // 2)), n))
+        # Every monomial is the product of two of at most half the degree (rounded up), which are few and come first. A
+        # product of many rows at once costs less than numpy's calls for one degree after the other.
+        self._features = np.ones((len(_exponents(model.degree)), n))
+        self._steps = _products(model.degree)
 
     def tilt(self, field_mT: FloatArray) -> FloatArray:
         """Tilt vectors, shape (2, n), rad, of one field reading per whisker, shape (n, 3), mT."""
@@ -149,14 +148,10 @@ class PolynomialEvaluator:
         transverse = np.sqrt(np.maximum(transverse_square, 1e-18))
         u[:2] *= np.arctan2(2.0 * transverse, u[2]) / transverse
         u[2] = strength * self._inverse_strength - 1.0
-        table = self._table
-        table[1:4] = u
-        at = 4
-        for parents, variables in self._half:
-            table[at : at + len(parents)] = table.take(parents, axis=0) * table.take(variables, axis=0)
-            at += len(parents)
-        features = table.take(self._first, axis=0)
-        features *= table.take(self._second, axis=0)
+        features = self._features
+        features[1:4] = u
+        for rows, first, second in self._steps:
+            np.multiply(features.take(first, axis=0), features.take(second, axis=0), out=features[rows])
         tilt: FloatArray = np.einsum("otn,tn->on", self._coefficients, features)
         return tilt
 
@@ -166,22 +161,19 @@ def _exponents(degree: int) -> list[tuple[int, ...]]:
     return [one for size in range(degree + 1) for one in combinations_with_replacement(range(3), size)]
 
 
-def _rows(degree: int) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
-    """How each degree from 2 to half of `degree` follows: rows of the table to be multiplied."""
-    known = _exponents((degree + 1) // 2)
-    place = {monomial: k for k, monomial in enumerate(known)}
-    steps = []
-    for size in range(2, (degree + 1) // 2 + 1):
-        made = [monomial for monomial in known if len(monomial) == size]
-        parents = np.array([place[monomial[:-1]] for monomial in made], dtype=np.intp)
-        steps.append((parents, np.array([place[monomial[-1:]] for monomial in made], dtype=np.intp)))
-    return steps
+def _products(degree: int) -> list[tuple[slice, NDArray[np.intp], NDArray[np.intp]]]:
+    """Rows of monomials, in the order of `_exponents`, each with the rows before it whose products they are.
 
-
-def _factors(degree: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Two rows of the table for each monomial up to `degree`, whose product it is."""
+    One degree after the other up to half of `degree`; all others at once.
+    """
     half = (degree + 1) // 2
-    place = {monomial: k for k, monomial in enumerate(_exponents(half))}
     wanted = _exponents(degree)
-    first = np.array([place[monomial[:half]] for monomial in wanted], dtype=np.intp)
-    return first, np.array([place[monomial[half:]] for monomial in wanted], dtype=np.intp)
+    place = {monomial: k for k, monomial in enumerate(wanted)}
+    ends = [len(_exponents(size)) for size in range(1, half + 1)] + [len(wanted)]
+    steps = []
+    for begin, end in pairwise(ends):
+        split = half if begin == ends[-2] else len(wanted[begin]) - 1
+        made = wanted[begin:end]
+        first = np.array([place[one[:split]] for one in made], dtype=np.intp)
+        steps.append((slice(begin, end), first, np.array([place[one[split:]] for one in made], dtype=np.intp)))
+    return steps

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.angle_estimator import WhiskerAngles
 from robominer_slam.layout import WhiskerLayout
 
 FloatArray = NDArray[np.float64]
@@ -18,12 +19,16 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Contacts:
-    """Contact points of one frame, shape (m, 3) in base_link, m; whose they are, and at what angles (rad)."""
+    """Contact points of one frame, shape (m, 3) in base_link, m; whose they are, and at what angles (rad).
+
+    rod: from base to tip, in base_link as it stood at the sensor's reading, shape (3, m), m.
+    """
 
     points: FloatArray
     index: NDArray[np.intp]
     inclination: FloatArray
     azimuth: FloatArray
+    rod: FloatArray
 
 
 def at_frame_start(contacts: Contacts, velocity: FloatArray, sensor_period_ns: int) -> Contacts:
@@ -44,7 +49,7 @@ def at_frame_start(contacts: Contacts, velocity: FloatArray, sensor_period_ns: i
     vx, vy, wz = velocity.tolist()
     points[:, 0] += later * (vx - wz * contacts.points[:, 1])
     points[:, 1] += later * (vy + wz * contacts.points[:, 0])
-    return Contacts(points, contacts.index, contacts.inclination, contacts.azimuth)
+    return Contacts(points, contacts.index, contacts.inclination, contacts.azimuth, contacts.rod)
 
 
 class ContactModel:
@@ -64,22 +69,11 @@ class ContactModel:
         self._reach = np.ascontiguousarray((layout.length[:, None, None] * layout.R_base_whisker).transpose(2, 1, 0))
         self._p_base = np.ascontiguousarray(layout.p_base.T)
 
-    def tips(self, inclination: FloatArray, azimuth: FloatArray) -> FloatArray:
-        """Tips of all whiskers in base_link, shape (n, 3), m, from angles of shape (n,), rad."""
-        return _tips(inclination, azimuth, self._reach, self._p_base)
-
-    def contacts(self, inclination: FloatArray, azimuth: FloatArray, valid: NDArray[np.bool_]) -> Contacts:
-        """Contact points of a frame; arrays of shape (n,), `valid` False for whiskers that say nothing."""
-        touching = valid & self._layout.present & (inclination >= self._min) & (inclination <= self._max)
+    def contacts(self, angles: WhiskerAngles, may_touch: NDArray[np.bool_]) -> Contacts:
+        """Contact points of a frame; `may_touch` is False for whiskers that say nothing, shape (n,)."""
+        inclination = angles.inclination
+        touching = may_touch & self._layout.present & (inclination >= self._min) & (inclination <= self._max)
         (index,) = touching.nonzero()
-        phi, a = inclination[index], azimuth[index]
-        points = _tips(phi, a, self._reach.take(index, axis=2), self._p_base.take(index, axis=1))
-        return Contacts(points, index, phi, a)
-
-
-def _tips(inclination: FloatArray, azimuth: FloatArray, reach: FloatArray, p_base: FloatArray) -> FloatArray:
-    sine = np.sin(inclination)
-    tips = p_base + sine * np.cos(azimuth) * reach[0]
-    tips += sine * np.sin(azimuth) * reach[1]
-    tips += np.cos(inclination) * reach[2]
-    return np.ascontiguousarray(tips.T)
+        rod = np.einsum("ikn,in->kn", self._reach, angles.direction).take(index, axis=1)
+        points = np.ascontiguousarray((self._p_base.take(index, axis=1) + rod).T)
+        return Contacts(points, index, inclination[index], angles.azimuth[index], rod)

@@ -179,8 +179,8 @@ class Pipeline:
         angles = self.angle_estimator.angles(frame.field_mT, frame.valid)
         odometry = self._dead_reckoning.state_at(stamp)
         well, may_touch = self.monitor.judge(frame, angles, odometry, self.angle_estimator)
-        angles = WhiskerAngles(angles.inclination, angles.azimuth, angles.sigma, well)
-        contacts = self._contact_model.contacts(angles.inclination, angles.azimuth, may_touch)
+        angles = WhiskerAngles(angles.inclination, angles.azimuth, angles.direction, well)
+        contacts = self._contact_model.contacts(angles, may_touch)
         contacts = at_frame_start(contacts, odometry.velocity, frame.sensor_period_ns)
         if len(contacts.index):
             self._contact_ns = stamp

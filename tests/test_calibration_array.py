@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calibration.angle_estimator import AngleEstimator
+from calibration.angle_estimator import BLOCKS, AngleEstimator
 from calibration.file_format import CalibrationFileError, check_fits, from_text, to_text
 from calibration.fit import FitError, FitReport, FloorFrames, JigSamples, fit_array
 from calibration.magnet_model import fold
@@ -19,6 +19,9 @@ from sim_backend.floor_capture import floor_capture
 from sim_backend.jig import jig_sweep, ring_sweep
 from sim_backend.magnet import HallArray
 from sim_backend.physics import hinge_angles, rod_direction
+
+ALL = np.ones(12, dtype=bool)
+R_LEVEL = np.eye(3)[None]
 
 
 @cache
@@ -65,8 +68,9 @@ def errors(
         assert a.valid.all()
         s = np.sin(a.inclination)
         d = np.stack([s * np.cos(a.azimuth), s * np.sin(a.azimuth), np.cos(a.inclination)], axis=-1)
+        np.testing.assert_allclose(a.direction.T, d, atol=1e-12)
         found.append(2.0 * np.arcsin(np.linalg.norm(d - truth, axis=-1) / 2.0))
-        sigma.append(a.sigma)
+        sigma.append(estimator.sigma(a.inclination))
     return np.rad2deg(found), np.rad2deg(sigma)
 
 
@@ -91,6 +95,27 @@ def test_the_stated_uncertainty_is_honest(source: str):
 
 def test_rings_fix_the_inclination_and_the_operators_touches_the_azimuth():
     assert rms(errors(fitted("rings").model)[0]) < 1.0
+
+
+def test_what_neighbours_add_follows_slow_rods_within_a_turn_of_all_blocks():
+    report = fitted("jig")
+    hall, n = HallArray(block(), 1), block().count
+
+    def directions(inclination: float, estimator: AngleEstimator) -> np.ndarray:
+        a = estimator.angles(hall.field(hinge_angles(np.full((1, n), inclination), np.zeros((1, n))), R_LEVEL)[0], ALL)
+        return a.direction
+
+    estimator = AngleEstimator(report.model)
+    for inclination in (0.3, 0.32, 0.34):
+        directions(inclination, estimator)
+    late = directions(0.34, estimator)
+    for _ in range(2 * BLOCKS):
+        settled = directions(0.34, estimator)
+    fresh = AngleEstimator(report.model)
+    for _ in range(20):
+        known = directions(0.34, fresh)
+    np.testing.assert_allclose(settled, known, atol=1e-5)
+    assert np.abs(late - known).max() < np.deg2rad(0.02)
 
 
 def test_neighbours_are_compensated():
@@ -167,10 +192,10 @@ def test_a_file_of_the_array_gives_the_same_angles_and_a_moved_array_is_refused(
     text = to_text(report, array_id="a", layout="block", rows=3, cols=4, date="2026-01-01")
     calibration = from_text(text, "a.json")
     field = np.random.default_rng(0).normal(0.0, 2.0, (12, 3)) + report.model.rest_mT
-    one = AngleEstimator(report.model).angles(field, np.ones(12, dtype=bool))
-    other = AngleEstimator(calibration.model).angles(field, np.ones(12, dtype=bool))
-    np.testing.assert_allclose(one.inclination, other.inclination, atol=1e-12)
-    np.testing.assert_allclose(one.sigma, other.sigma, atol=1e-12)
+    fresh, read = AngleEstimator(report.model), AngleEstimator(calibration.model)
+    one, other = (estimator.angles(field, np.ones(12, dtype=bool)).inclination for estimator in (fresh, read))
+    np.testing.assert_allclose(one, other, atol=1e-12)
+    np.testing.assert_allclose(fresh.sigma(one), read.sigma(other), atol=1e-12)
     check_fits(calibration, layout="block", rows=3, cols=4, where="a.json", p_base=block().p_base)
     moved = block().p_base + np.array([0.0, 0.01, 0.0])
     with pytest.raises(CalibrationFileError, match="10 mm from where"):

@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from calibration.angle_estimator import WhiskerAngles
 from robominer_slam import layout as layouts
 from robominer_slam.contacts import ContactModel, Contacts, at_frame_start
 from robominer_slam.layout import LayoutError, from_json, rm3, thesis_grid, to_json
+
+
+def leaning(phi: np.ndarray, a: np.ndarray) -> WhiskerAngles:
+    direction = np.stack([np.sin(phi) * np.cos(a), np.sin(phi) * np.sin(a), np.cos(phi)])
+    return WhiskerAngles(phi, a, direction, np.ones(len(phi), dtype=bool))
 
 
 def test_thesis_grid_is_as_the_interface_says():
@@ -45,7 +51,9 @@ def test_tips_equal_rotating_the_rod_by_scipy():
     phi, a = rng.uniform(0, 1.2, array.count), rng.uniform(-np.pi, np.pi, array.count)
     rod = Rotation.from_euler("ZY", np.column_stack([a, phi])).apply([0, 0, 0.15])
     expected = array.p_base + Rotation.from_matrix(array.R_base_whisker).apply(rod)
-    np.testing.assert_allclose(ContactModel(array, 0.1, 1.2).tips(phi, a), expected, atol=1e-12)
+    found = ContactModel(array, 0.0, 1.3).contacts(leaning(phi, a), np.ones(array.count, dtype=bool))
+    np.testing.assert_allclose(found.points, expected, atol=1e-12)
+    np.testing.assert_allclose(found.rod.T, expected - array.p_base, atol=1e-12)
 
 
 def test_free_whiskers_holes_and_invalid_readings_give_no_contact():
@@ -57,7 +65,7 @@ def test_free_whiskers_holes_and_invalid_readings_give_no_contact():
     phi[0], phi[1] = 0.01, 1.5
     valid = np.ones(64, dtype=bool)
     valid[2] = False
-    contacts = ContactModel(grid, 0.07, 1.22).contacts(phi, np.zeros(64), valid)
+    contacts = ContactModel(grid, 0.07, 1.22).contacts(leaning(phi, np.zeros(64)), valid)
     assert contacts.index.tolist() == list(range(4, 64))
     assert contacts.points.shape == (60, 3)
 
@@ -87,7 +95,7 @@ def test_contacts_of_a_frame_are_brought_to_the_time_of_its_first_sensor():
         c, s = np.cos(yaw), np.sin(yaw)
         dx, dy = point[0] - x, point[1] - y
         read.append([c * dx + s * dy, c * dy - s * dx, point[2]])
-    contacts = Contacts(np.array(read), index, np.zeros(4), np.zeros(4))
+    contacts = Contacts(np.array(read), index, np.zeros(4), np.zeros(4), np.zeros((3, 4)))
     found = at_frame_start(contacts, velocity, period_ns)
     np.testing.assert_allclose(found.points, world, atol=5e-5)
     assert np.abs(contacts.points - world).max() > 3e-3

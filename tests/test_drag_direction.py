@@ -40,7 +40,8 @@ def trailing(velocity, layout=LAYOUT, inclination=0.6, noise=0.0, rng=None) -> C
     azimuth = np.arctan2(-rod[:, 1], rod[:, 0])
     n = layout.count
     points = np.column_stack([layout.p_base[:, :2] + reach[:, None] * rod, np.full(n, -0.12)])
-    return Contacts(points, np.arange(n), np.full(n, inclination), azimuth)
+    rods = np.column_stack([reach[:, None] * rod, np.full(n, -0.12)]).T
+    return Contacts(points, np.arange(n), np.full(n, inclination), azimuth, rods)
 
 
 def measure(true_velocity, estimate, frames=60, noise=0.0, layout=LAYOUT):
@@ -126,7 +127,7 @@ def test_the_array_shows_the_direction_on_a_recorded_drive():
         twist = truth[frame.stamp_ns]
         velocity = twist[[0, 1, 5]]
         found = angles.angles(frame.field_mT, frame.valid)
-        touching = contacts.contacts(found.inclination, found.azimuth, found.valid)
+        touching = contacts.contacts(found, found.valid)
         one = drag.measure(frame.stamp_ns, touching, velocity, np.diag([1e-8, 0.05, 0.3]) ** 2)
         if one is not None and abs(velocity[2]) < 0.02:
             left = np.array([-one.ahead[1], one.ahead[0]])

@@ -116,7 +116,8 @@ def angles(calibration_file: Path, file: Path) -> None:
         field = np.zeros((estimator.count, 3))
         field[i] = line_values[2:]
         result = estimator.angles(field, np.ones(estimator.count, dtype=np.bool_))
-        values = [result.inclination[i], result.azimuth[i], result.sigma[i]] if result.valid[i] else [np.nan] * 3
+        sigma = estimator.sigma(result.inclination)
+        values = [result.inclination[i], result.azimuth[i], sigma[i]] if result.valid[i] else [np.nan] * 3
         degrees = ",".join(f"{v:.4f}" for v in np.rad2deg(values))
         b = ",".join(f"{v:g}" for v in line_values[2:])
         click.echo(f"{int(line_values[0])},{int(line_values[1])},{b},{degrees}")

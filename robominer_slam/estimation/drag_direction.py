@@ -77,8 +77,6 @@ class DragDirection:
         self._least_inclination = math.radians(settings.drag_min_inclination_deg)
         self._sigma2 = math.radians(settings.drag_sigma_deg) ** 2
         self._slopes = CrossSlope(layout, self._floor)
-        #: Horizontal parts of the mounts' axes times the rods' lengths, shape (3 axes, 2, n).
-        self._columns = np.ascontiguousarray(layout.R_base_whisker[:, :2].transpose(2, 1, 0)) * layout.length
         self._frames: deque[tuple[int, Contacts]] = deque(maxlen=WINDOW + 1)
         self._way = 0.0
         self._last_ns: int | None = None
@@ -87,14 +85,6 @@ class DragDirection:
         self._slide_information = settings.drag_sigma_slide**-2
         #: Estimated angle by which a cross slope turns a rod, rad per slope.
         self.slide = settings.drag_slide
-
-    def reach(self, contacts: Contacts) -> FloatArray:
-        """Horizontal vectors from base to tip, shape (2, m), m, in base_link."""
-        sine = np.sin(contacts.inclination)
-        x, y, z = sine * np.cos(contacts.azimuth), sine * np.sin(contacts.azimuth), np.cos(contacts.inclination)
-        columns = self._columns[:, :, contacts.index]
-        rod: FloatArray = columns[0] * x + columns[1] * y + columns[2] * z
-        return rod
 
     def measure(
         self, stamp_ns: int, contacts: Contacts, velocity: FloatArray, covariance: FloatArray
@@ -150,9 +140,9 @@ class DragDirection:
 
     def _trailing(self, contacts: Contacts, old: Contacts, span: float, velocity: FloatArray) -> TrailingTips | None:
         index = contacts.index
-        rod = self.reach(contacts)
+        rod = contacts.rod[:2]
         earlier = np.full((2, self._layout.count), np.nan)
-        earlier[:, old.index] = self.reach(old)
+        earlier[:, old.index] = old.rod[:2]
         turning = (rod - earlier[:, index]) / span
         p = self._layout.p_base[index, :2].T + rod
         swept = swept_by(p, turning, velocity)
