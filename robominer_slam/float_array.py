@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from array import array
+from struct import pack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,4 +10,4 @@ from numpy.typing import NDArray
 
 def of_floats(values: list[float]) -> NDArray[np.float64]:
     """The floats as an array, shape (n,)."""
-    return np.frombuffer(array("d", values))
+    return np.frombuffer(bytearray(pack(f"{len(values)}d", *values)))

@@ -8,7 +8,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 
 from robominer_slam.estimation.kalman_filter import KalmanFilter
 from robominer_slam.estimation.planar_filter import PlanarFilter
-from robominer_slam.estimation.planar_motion import SLIP, Inputs, step
+from robominer_slam.estimation.planar_motion import SLIP, Inputs, MotionNoise, step
 
 N = 17
 
@@ -68,15 +68,24 @@ def test_what_is_held_does_not_move_and_the_covariance_is_josephs(m: int) -> Non
 def test_a_prediction_is_filterpys(fading: float) -> None:
     rng, x, P = started(3)
     inputs = Inputs(0.02, 0.3, np.array([0.2, -0.05]), np.array([[0.98, 0.05], [-0.02, 0.99]]))
-    q, Q_velocity = rng.uniform(0.0, 1.0, N), np.diag([0.1, 0.2, 0.3])
+    q, noise = rng.uniform(0.0, 1.0, N), MotionNoise(0.1, 0.05, 0.2, 0.3, 0.4)
     moved = step(x, inputs)
-    F, effect = np.eye(N), np.zeros((N, 3))
-    F[:6], effect[:6] = moved.by_state, moved.by_velocity
-    F[SLIP, SLIP] *= fading
+    F, effect = np.eye(N), np.zeros((N, 5))
+    F[:6] = moved.by_state
+    # Of vx, vy, wz in the interval, and of x and y beside them.
+    effect[:2, :3], effect[2, 2] = np.reshape(moved.pose_by_velocity, (2, 3)), inputs.dt
+    effect[3:6, :3], effect[:2, 3:] = np.eye(3), np.eye(2)
+    Q = np.diag([0.1, 0.2, 0.3, 0.4, 0.4])
+    Q[0, 1] = Q[1, 0] = 0.05
+    fade = np.ones(N)
+    fade[SLIP] = fading
     theirs = ExtendedKalmanFilter(N, 1)
-    theirs.P, theirs.F, theirs.Q = P.copy(), F, np.diag(q) + effect @ Q_velocity @ effect.T
+    theirs.P, theirs.F, theirs.Q = P.copy(), F, effect @ Q @ effect.T
+    theirs.predict()
+    theirs.F, theirs.Q = np.diag(fade), np.diag(q)
     theirs.predict()
     ours = PlanarFilter(x.copy(), P.copy(), 9.0)
-    ours.move(inputs, Q_velocity, q.tolist(), fading)
+    ours.move(inputs, noise)
+    ours.walk(q.tolist(), fading)
     np.testing.assert_allclose(ours.P, theirs.P, atol=1e-12)
     np.testing.assert_allclose(ours.x[SLIP], fading * x[SLIP], atol=1e-15)

@@ -15,6 +15,7 @@ from robominer_slam.estimation.planar_motion import (
     WINDOW_YAW,
     YAW,
     Inputs,
+    MotionNoise,
     compose,
     compose_jacobian,
     step,
@@ -27,41 +28,41 @@ FloatArray = NDArray[np.float64]
 class PlanarFilter(KalmanFilter):
     """State of `planar_motion`."""
 
-    def move(self, inputs: Inputs, Q_velocity: FloatArray, q: list[float], fading: float = 1.0) -> None:
-        """Predict to the end of an interval.
-
-        Args:
-            inputs: what moves the state.
-            Q_velocity: covariance of the velocity in the interval, shape (3, 3).
-            q: variances that the interval adds to the states, n of them.
-            fading: factor by which the varying slip fades.
-        """
+    def move(self, inputs: Inputs, noise: MotionNoise) -> None:
+        """Predict to the end of an interval."""
         moved = step(self.x, inputs)
         x, F, P = moved.state, moved.by_state, self.P
         # P = F P F' + Q, where all rows of F but the first six are the unit matrix's: a third of the products.
         rows = F.dot(P)
         corner = rows.dot(F.T)
-        corner += moved.by_velocity.dot(Q_velocity).dot(moved.by_velocity.T)
+        corner += moved.covariance(noise)
         later = P.copy()
         later[:KEY_X] = rows
         later[KEY_X:, :KEY_X] = rows[:, KEY_X:].T
         later[:KEY_X, :KEY_X] = corner
+        self.x, self.P = x, later
+
+    def walk(self, q: list[float], fading: float = 1.0) -> None:
+        """Let states walk by the variances q, n of them, after the varying slip has faded by a factor."""
+        x, P = self.x, self.P
         if fading < 1.0:
             fade = np.ones(len(x))
             fade[SLIP] = fading
-            x *= fade
-            later *= fade
-            later *= fade[:, None]
-        later.reshape(-1)[:: len(q) + 1] += of_floats(q)
-        self.x, self.P = x, later
+            x, P = x * fade, P * fade
+            P *= fade[:, None]
+        else:
+            P = P.copy()
+        P.reshape(-1)[:: len(q) + 1] += of_floats(q)
+        self.x, self.P = x, P
 
     def begin_window(self) -> None:
         """Keep the present heading in odom as the window's."""
-        T = np.eye(len(self.x))
-        T[WINDOW_YAW] = 0.0
-        T[WINDOW_YAW, [YAW, KEY_YAW]] = 1.0
-        self.x = T @ self.x
-        self.P = T @ self.P @ T.T
+        x, P = self.x.copy(), self.P.copy()
+        x[WINDOW_YAW] = x[YAW] + x[KEY_YAW]
+        # T P T' with a T that puts the sum of two rows in the place of a third.
+        P[WINDOW_YAW] = P[YAW] + P[KEY_YAW]
+        P[:, WINDOW_YAW] = P[:, YAW] + P[:, KEY_YAW]
+        self.x, self.P = x, P
 
     def keyframe(self) -> None:
         """Make the present pose the keyframe's: the pose since becomes zero and is known."""

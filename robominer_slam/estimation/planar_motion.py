@@ -12,6 +12,7 @@ measurement v / (1 - slip) against a walk of v reads slip out of every accelerat
 from __future__ import annotations
 
 import math
+from array import array
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -48,18 +49,54 @@ class Inputs:
 
 
 @dataclass(frozen=True, slots=True)
+class MotionNoise:
+    """Covariance of what moves the state in an interval: xx, xy, yy of vx and vy, of wz, and of x and y beside them."""
+
+    xx: float
+    xy: float
+    yy: float
+    turn: float
+    position: float
+
+
+@dataclass(frozen=True, slots=True)
 class Step:
     """An interval's motion: the state after it, and derivatives of what moves, X to WZ (the other states stay).
 
     Attributes:
         state: after the interval, shape (n,).
         by_state: derivative of the moving states by the state before, shape (6, n).
-        by_velocity: derivative of the moving states by the velocity in the interval, shape (6, 3).
+        pose_by_velocity: derivative of x and y by the velocity in the interval, row by row; that of yaw by the turn
+            rate is dt, and the velocity is itself.
+        dt: length of the interval, s.
     """
 
     state: FloatArray
     by_state: FloatArray
-    by_velocity: FloatArray
+    pose_by_velocity: tuple[float, float, float, float, float, float]
+    dt: float
+
+    def covariance(self, noise: MotionNoise) -> FloatArray:
+        """What noise adds to the covariance of the moving states, shape (6, 6): G Q G' with G their derivative by it.
+
+        In plain floats, as `step`.
+        """
+        xx, xy, xw, yx, yy, yw = self.pose_by_velocity
+        dt, q_xy, q_w = self.dt, noise.xy, noise.turn
+        # Covariances of x, y and yaw with the velocity: G Q, whose last rows are Q.
+        ax, bx, cx = xx * noise.xx + xy * q_xy, xx * q_xy + xy * noise.yy, xw * q_w
+        ay, by, cy = yx * noise.xx + yy * q_xy, yx * q_xy + yy * noise.yy, yw * q_w
+        turned = dt * q_w
+        across = ax * yx + bx * yy + cx * yw
+        rows = [
+            *(ax * xx + bx * xy + cx * xw + noise.position, across, cx * dt, ax, bx, cx),
+            *(across, ay * yx + by * yy + cy * yw + noise.position, cy * dt, ay, by, cy),
+            *(cx * dt, cy * dt, turned * dt, 0.0, 0.0, turned),
+            *(ax, ay, 0.0, noise.xx, q_xy, 0.0),
+            *(bx, by, 0.0, q_xy, noise.yy, 0.0),
+            *(cx, cy, turned, 0.0, 0.0, q_w),
+        ]
+        return of_floats(rows).reshape(6, 6)
 
 
 def step(state: FloatArray, inputs: Inputs) -> Step:
@@ -98,8 +135,8 @@ def step(state: FloatArray, inputs: Inputs) -> Step:
     xx, xy = c * a - s * d, c * b - s * e
     yx, yy = s * a + c * d, s * b + c * e
     xw, yw = -0.5 * dt * dy, 0.5 * dt * dx
-    # The six rows one after the other: row k begins at k n.
-    F = [0.0] * (6 * n)
+    # The six rows one after the other: row k begins at k n. Most of them are zeros, which need not be handed over.
+    F = array("d", bytes(8 * 6 * n))
     F[X] = F[n + Y] = F[2 * n + YAW] = 1.0
     F[YAW], F[n + YAW] = -dy, dx
     for column in by_vx:
@@ -114,15 +151,14 @@ def step(state: FloatArray, inputs: Inputs) -> Step:
     F[n + by_wz] += yw * slope_wz
     F[2 * n + by_wz] += dt * slope_wz
     F[WZ * n + by_wz] = slope_wz
-    by_velocity = [xx, xy, xw, yx, yy, yw, 0.0, 0.0, dt, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
-    return Step(of_floats(values), of_floats(F).reshape(6, n), of_floats(by_velocity).reshape(6, 3))
+    return Step(of_floats(values), np.frombuffer(F).reshape(6, n), (xx, xy, xw, yx, yy, yw), dt)
 
 
 def compose(state: FloatArray) -> FloatArray:
     """Pose of the levelled base_link in odom (x, y, yaw), shape (3,): keyframe's pose times the pose since."""
     x, y, yaw, _, _, _, key_x, key_y, key_yaw, *_ = state.tolist()
     c, s = math.cos(key_yaw), math.sin(key_yaw)
-    return np.array([key_x + c * x - s * y, key_y + s * x + c * y, key_yaw + yaw])
+    return of_floats([key_x + c * x - s * y, key_y + s * x + c * y, key_yaw + yaw])
 
 
 def given_bias(state: FloatArray, P: FloatArray, bias: slice) -> tuple[FloatArray, FloatArray]:
@@ -140,13 +176,15 @@ def given_bias(state: FloatArray, P: FloatArray, bias: slice) -> tuple[FloatArra
 
 def compose_jacobian(state: FloatArray) -> FloatArray:
     """Derivative of `compose` by the state, shape (3, n)."""
-    J = np.zeros((3, len(state)))
+    n = len(state)
+    # The three rows one after the other.
+    J = array("d", bytes(8 * 3 * n))
     x, y, _, _, _, _, _, _, key_yaw, *_ = state.tolist()
     c, s = math.cos(key_yaw), math.sin(key_yaw)
-    J[0, X], J[0, Y], J[1, X], J[1, Y] = c, -s, s, c
-    J[0, KEY_X] = J[1, KEY_Y] = J[2, KEY_YAW] = J[2, YAW] = 1.0
-    J[0, KEY_YAW], J[1, KEY_YAW] = -s * x - c * y, c * x - s * y
-    return J
+    J[X], J[Y], J[n + X], J[n + Y] = c, -s, s, c
+    J[KEY_X] = J[n + KEY_Y] = J[2 * n + KEY_YAW] = J[2 * n + YAW] = 1.0
+    J[KEY_YAW], J[n + KEY_YAW] = -s * x - c * y, c * x - s * y
+    return np.frombuffer(J).reshape(3, n)
 
 
 def motion_ahead(state: FloatArray, ahead: FloatArray, screws: FloatArray | None) -> FloatArray:

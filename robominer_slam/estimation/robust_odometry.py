@@ -28,11 +28,9 @@ from robominer_slam.estimation.planar_filter import PlanarFilter
 from robominer_slam.estimation.planar_motion import (
     GYRO_BIAS,
     REL,
-    SLIP,
     VELOCITY,
     Inputs,
-    X,
-    Y,
+    MotionNoise,
     compose,
     compose_jacobian,
     given_bias,
@@ -41,9 +39,9 @@ from robominer_slam.estimation.planar_motion import (
 from robominer_slam.estimation.planar_start import MATCH_STATES, ODOMETRY_BIAS
 from robominer_slam.estimation.scan_match import match_measurement, relative_covariance
 from robominer_slam.estimation.screw_speeds import MAX_INTERVAL_S, ScrewAngleSpeeds, ScrewSpeedAssembly
+from robominer_slam.estimation.slow_walk import SlowWalk
 from robominer_slam.estimation.spatial_pose import SpatialPose
 from robominer_slam.estimation.turn_comparison import TurnComparison
-from robominer_slam.float_array import of_floats
 
 FloatArray = NDArray[np.float64]
 Source = Literal["fused", "odometry"]
@@ -78,7 +76,7 @@ class RobustOdometry:
         fused = source == "fused"
         x, variance = planar_start.fused(settings) if fused else planar_start.odometry(settings)
         self._match = slice(len(x) - MATCH_STATES, len(x))
-        self._match_variance: list[float] = variance[self._match].tolist()
+        self._walk = SlowWalk(settings, fused, self._match, variance[self._match].tolist())
         self._bias = slice(GYRO_BIAS, GYRO_BIAS + 1) if fused else ODOMETRY_BIAS
         self._filter = PlanarFilter(x, np.diag(variance), settings.gate)
         self._H_odometry = planar_start.odometry_rows()
@@ -96,8 +94,8 @@ class RobustOdometry:
         self._odometry_ns: int | None = None
         self._screws_ns: int | None = None
         self._input = np.zeros(2)
-        #: Covariance of the screws' vx, vy, row by row.
-        self._Q_input = [0.0] * 4
+        #: Covariance of the screws' vx, vy: xx, xy, yy.
+        self._Q_input = (0.0, 0.0, 0.0)
         self._state: OdometryState | None = None
         self._stale = 0
 
@@ -149,7 +147,7 @@ class RobustOdometry:
         pose = compose(x)
         x_odom, y_odom, yaw_odom = pose.tolist()
         J = compose_jacobian(x)
-        covariance = J @ P @ J.T
+        covariance = J.dot(P).dot(J.T)
         self._state = OdometryState(
             stamp_ns,
             x_odom,
@@ -166,6 +164,7 @@ class RobustOdometry:
     def mark_keyframe(self, stamp_ns: int) -> KeyframeMotion:
         """Motion since the last mark (or the start); the present pose becomes the new reference."""
         self._go_on(stamp_ns)
+        self._filter.walk(*self._walk.take())
         x, P, b = self._filter.x, self._filter.P, self._bias
         T, covariance, jacobian = self._space.motion(x[REL], *given_bias(x, P, b))
         marked, self._marked_ns = self._marked_ns, stamp_ns
@@ -195,6 +194,7 @@ class RobustOdometry:
             information: of it, shape (3, 3); directions without information are left alone.
         """
         self._go_on(stamp_ns)
+        self._filter.walk(*self._walk.take())
         told = match_measurement(self._filter.x, self._match, offset, information)
         if told is not None:
             self._filter.correct(*told)
@@ -248,11 +248,11 @@ class RobustOdometry:
         self._input = screws[:2]
         if still:
             creep = settings.sigma_still**2 / readings
-            self._Q_input = [creep, 0.0, 0.0, creep]
+            self._Q_input = (creep, 0.0, creep)
         else:
             mode, distrust = (settings.slip_mode_weight * slip) ** 2 / readings, self._distrust / readings
-            xx, xy, yx, yy = self._R_linear
-            self._Q_input = [xx * distrust + mode, xy * distrust, yx * distrust, yy * distrust + mode]
+            xx, xy, _, yy = self._R_linear
+            self._Q_input = (xx * distrust + mode, xy * distrust, yy * distrust + mode)
         self._predict(stamp_ns)
         if before is None:
             return
@@ -279,32 +279,22 @@ class RobustOdometry:
         self._stamp_ns = stamp_ns
         settings, ekf = self._settings, self._filter
         dt = (stamp_ns - previous) * 1e-9
-        x = ekf.x
-        q = [0.0] * len(x)
-        vx, vy, wz = x[VELOCITY].tolist()
+        vx, vy, wz = ekf.x[VELOCITY].tolist()
         way = math.hypot(vx, vy) * dt
-        q[X] = q[Y] = settings.position_walk**2 * way
-        again = 2.0 * way / settings.match_length
-        q[self._match] = [variance * again for variance in self._match_variance]
+        walked = self._walk.add(way, abs(wz) * dt, dt)
         walk = settings.acceleration_walk**2 * dt
         turn_walk = settings.angular_acceleration_walk**2 * dt
-        Q_linear = [walk, 0.0, 0.0, walk]
+        Q_linear = (walk, 0.0, walk)
         gyro = screws = None
-        kept = 1.0
         if self._source == "fused":
             gyro, turn_walk = self._turn(previous, stamp_ns, dt, turn_walk)
             if self._screws_ns is not None and stamp_ns - self._screws_ns < MAX_INTERVAL_S * 1e9:
                 screws = self._input
                 Q_linear = self._Q_input
-            q[GYRO_BIAS] = settings.gyro_bias_walk**2 * dt
-            turned = way + abs(wz) * dt * settings.slip_turn_arm
-            kept = math.exp(-turned / settings.slip_length)
-            q[SLIP] = [settings.sigma_slip**2 * (1.0 - kept * kept)] * 3
-        else:
-            q[ODOMETRY_BIAS] = [settings.odometry_bias_walk**2 * dt] * 3
-        xx, xy, yx, yy = Q_linear
-        Q_velocity = of_floats([xx, xy, 0.0, yx, yy, 0.0, 0.0, 0.0, turn_walk]).reshape(3, 3)
-        ekf.move(Inputs(dt, gyro, screws, self._space.rotation[:2, :2]), Q_velocity, q, kept)
+        noise = MotionNoise(*Q_linear, turn_walk, settings.position_walk**2 * way)
+        ekf.move(Inputs(dt, gyro, screws, self._space.rotation[:2, :2]), noise)
+        if walked:
+            ekf.walk(*self._walk.take())
         self._space.advance(ekf.x[VELOCITY], dt)
 
     def _turn(self, from_ns: int, until_ns: int, dt: float, walk: float) -> tuple[float | None, float]:

@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 from robominer_slam.configuration.robust_estimation_section import RobustEstimationSection
 from robominer_slam.estimation.imu_batch import ImuBatch
 from robominer_slam.estimation.tilt import Tilt, Vector
+from robominer_slam.float_array import of_floats
 
 FloatArray = NDArray[np.float64]
 
 #: Rows of a twist (translation first) that the planar filter knows.
 PLANAR = [0, 1, 5]
-IN_PLANE = np.ix_(PLANAR, PLANAR)
+#: Up in the axes of a level body.
+LEVEL: Vector = (0.0, 0.0, 1.0)
 
 
 class SpatialPose:
@@ -65,7 +67,7 @@ class SpatialPose:
     def advance(self, velocity: FloatArray, dt: float) -> None:
         """Go on by the body velocity (vx, vy, wz)."""
         vx, vy, _ = velocity.tolist()
-        up_x, up_y, _ = self.rotation[2].tolist()
+        up_x, up_y, _ = LEVEL if self._tilt is None else self._tilt.up
         self.way += math.hypot(vx, vy) * dt
         self.z += (up_x * vx + up_y * vy) * dt
 
@@ -78,12 +80,18 @@ class SpatialPose:
         settings = self._settings
         driven = self.way if way is None else way
         tilt = math.radians(settings.sigma_tilt_deg) ** 2
-        covariance = np.zeros((6, 6))
-        covariance[IN_PLANE] = planar
         climbed = 0.0 if self._tilt is None else tilt * driven * driven
-        covariance[2, 2] = settings.height_walk**2 * (driven + 0.01) + climbed
-        covariance[3, 3] = covariance[4, 4] = tilt
-        return covariance
+        height = settings.height_walk**2 * (driven + 0.01) + climbed
+        (xx, xy, xw), (yx, yy, yw), (wx, wy, ww) = planar.tolist()
+        rows = [
+            *(xx, xy, 0.0, 0.0, 0.0, xw),
+            *(yx, yy, 0.0, 0.0, 0.0, yw),
+            *(0.0, 0.0, height, 0.0, 0.0, 0.0),
+            *(0.0, 0.0, 0.0, tilt, 0.0, 0.0),
+            *(0.0, 0.0, 0.0, 0.0, tilt, 0.0),
+            *(wx, wy, 0.0, 0.0, 0.0, ww),
+        ]
+        return of_floats(rows).reshape(6, 6)
 
     def motion(
         self, planar: FloatArray, covariance: FloatArray, by_bias: FloatArray
@@ -114,11 +122,6 @@ def _pose(planar: FloatArray, z: float, tilt: FloatArray) -> FloatArray:
     x, y, yaw = planar.tolist()
     c, s = math.cos(yaw), math.sin(yaw)
     (ax, ay, az), (bx, by, bz), up = tilt.tolist()
-    return np.array(
-        [
-            [c * ax - s * bx, c * ay - s * by, c * az - s * bz, x],
-            [s * ax + c * bx, s * ay + c * by, s * az + c * bz, y],
-            [*up, z],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    )
+    ahead = [c * ax - s * bx, c * ay - s * by, c * az - s * bz, x]
+    left = [s * ax + c * bx, s * ay + c * by, s * az + c * bz, y]
+    return of_floats([*ahead, *left, *up, z, 0.0, 0.0, 0.0, 1.0]).reshape(4, 4)

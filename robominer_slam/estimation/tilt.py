@@ -19,6 +19,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from robominer_slam.float_array import of_floats
+
 FloatArray = NDArray[np.float64]
 Vector: TypeAlias = tuple[float, float, float]
 
@@ -106,13 +108,8 @@ class Tilt:
         cos_pitch = math.sqrt(uy * uy + uz * uz)
         sin_roll, cos_roll = uy / cos_pitch, uz / cos_pitch
         sin_pitch = -ux
-        return np.array(
-            [
-                [cos_pitch, sin_pitch * sin_roll, sin_pitch * cos_roll],
-                [0.0, cos_roll, -sin_roll],
-                [ux, uy, uz],
-            ]
-        )
+        ahead = [cos_pitch, sin_pitch * sin_roll, sin_pitch * cos_roll]
+        return of_floats([*ahead, 0.0, cos_roll, -sin_roll, ux, uy, uz]).reshape(3, 3)
 
     def turn_rate(self, rate: Vector) -> float:
         """Rate of the heading about the vertical, rad/s, for a body rate; the vertical bias is left in."""
