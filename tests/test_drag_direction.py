@@ -108,8 +108,16 @@ def test_slopes_of_a_plane_are_found():
     contacts = trailing([0.15, 0.0, 0.0])
     points = contacts.points.copy()
     points[:, 2] = 0.1 * points[:, 0] - 0.2 * points[:, 1]
-    gradient = CrossSlope(LAYOUT, floor).gradient(points, contacts.index)
+    slopes = CrossSlope(LAYOUT, floor)
+    gradient = slopes.gradient(points, contacts.index, np.arange(64))
     np.testing.assert_allclose(gradient, [[0.1] * 64, [-0.2] * 64], atol=0.02)
+    # Whiskers that do not touch are left out, and so are those that point elsewhere.
+    points[::3, 2] += 1.0
+    touching = np.flatnonzero(np.arange(64) % 3)
+    few = slopes.gradient(points[touching], contacts.index[touching], np.arange(1, 42, 2))
+    np.testing.assert_allclose(few, [[0.1] * 21, [-0.2] * 21], atol=0.03)
+    elsewhere = CrossSlope(LAYOUT, np.arange(64) % 3 > 0).gradient(points, contacts.index, touching[1:42:2])
+    np.testing.assert_allclose(elsewhere, few, atol=0.001)
 
 
 def test_the_array_shows_the_direction_on_a_recorded_drive():

@@ -30,35 +30,39 @@ class CrossSlope:
         p = np.where((floor & layout.present)[:, None], layout.p_base, 1e6)
         distance = np.square(p[:, None] - p[None]).sum(axis=-1)
         np.fill_diagonal(distance, np.inf)
-        self._neighbours = np.argsort(distance, axis=1)[:, :NEIGHBOURS]
-        self._tips = np.empty((3, layout.count))
+        #: Neighbours first, shape (k, n): sums over them then run along whole rows of tips.
+        self._neighbours = np.ascontiguousarray(np.argsort(distance, axis=1)[:, :NEIGHBOURS].T)
+        #: x, y, z of each whisker's tip, and 1 where it touches.
+        self._tips = np.empty((4, layout.count))
         self._unusable = np.flatnonzero(~floor)
 
-    def gradient(self, tips: FloatArray, index: NDArray[np.intp]) -> FloatArray:
-        """Slope of the ground along x and y at each tip, shape (2, m); zero where too few neighbours touch.
+    def gradient(self, tips: FloatArray, index: NDArray[np.intp], of: NDArray[np.intp]) -> FloatArray:
+        """Slope of the ground along x and y at some tips, shape (2, k); zero where too few neighbours touch.
 
         Args:
             tips: in base_link, shape (m, 3), m.
             index: whose they are, shape (m,).
+            of: which of them are asked for, shape (k,).
         """
-        everyone = self._tips
-        everyone.fill(np.nan)
-        everyone[:, index] = tips.T
+        everyone, at = self._tips, tips.T
+        everyone.fill(0.0)
+        everyone[:3, index] = at
+        everyone[3, index] = 1.0
         if len(self._unusable):
-            everyone[:, self._unusable] = np.nan
-        dx, dy, dz = everyone[:, self._neighbours[index]] - tips.T[:, :, None]
+            everyone[3, self._unusable] = 0.0
+        around = everyone.take(self._neighbours.take(index.take(of), axis=1), axis=1)
+        offset, touches = around[:3], around[3]
+        offset -= at.take(of, axis=1)[:, None]
+        # A neighbour that does not touch lies at the tip itself, so to speak: there it weighs nothing in any sum.
+        offset *= touches
+        dx, dy, _ = offset
         weight = 1.0 / (dx * dx + dy * dy + NEAR**2)
-        unknown = dz != dz
-        if np.count_nonzero(unknown):
-            for part in (weight, dx, dy, dz):
-                part[unknown] = 0.0
-        wx, wy = weight * dx, weight * dy
-        xx, xy, yy = (wx * dx).sum(axis=1), (wx * dy).sum(axis=1), (wy * dy).sum(axis=1)
-        xz, yz = (wx * dz).sum(axis=1), (wy * dz).sum(axis=1)
+        xx, xy, xz = np.einsum("km,akm->am", weight * dx, offset)
+        yy, yz = np.einsum("km,akm->am", weight * dy, offset[1:])
         xx += FLATNESS / NEAR**2
         yy += FLATNESS / NEAR**2
         determinant = xx * yy - xy * xy
-        slopes = np.empty((2, len(index)))
+        slopes = np.empty((2, len(of)))
         np.divide(yy * xz - xy * yz, determinant, out=slopes[0])
         np.divide(xx * yz - xy * xz, determinant, out=slopes[1])
         return slopes

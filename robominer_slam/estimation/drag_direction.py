@@ -77,6 +77,7 @@ class DragDirection:
         self._least_inclination = math.radians(settings.drag_min_inclination_deg)
         self._sigma2 = math.radians(settings.drag_sigma_deg) ** 2
         self._slopes = CrossSlope(layout, self._floor)
+        self._p_base = np.ascontiguousarray(layout.p_base[:, :2].T)
         self._frames: deque[tuple[int, Contacts]] = deque(maxlen=WINDOW + 1)
         self._way = 0.0
         self._last_ns: int | None = None
@@ -125,7 +126,12 @@ class DragDirection:
         new_way = self._shown_way < settings.drag_length
         at = direction / METRIC * size
         found = self._information(tips, at)
-        shown = self._shown(found, velocity, covariance)
+        # Corrections of the velocity by what the frame says of it, and by the part of it that `slide` makes.
+        told = np.array([found.vector, found.sliding_rows])
+        corrections = np.linalg.solve(EYE + covariance.dot(found.information), covariance.dot(told.T))
+        scaled = (velocity + corrections[:, 0]) * METRIC
+        # Direction of the motion as this frame shows it: scaled (vx, vy, wz) of length one.
+        shown = scaled / max(math.sqrt(scaled @ scaled), 1e-9)
         self._shown_way += way
         direction = direction + way / min(self._shown_way, SHOWN_LENGTH) * (shown - direction)
         self._direction = direction / math.sqrt(direction @ direction)
@@ -133,18 +139,19 @@ class DragDirection:
         if new_way or speed < settings.drag_least_speed:
             return None
         discount = min(1.0, way / (2.0 * settings.drag_length))
-        self._learn_slide(found, covariance, discount)
-        shared = np.linalg.inv(EYE + found.information @ self._common(velocity)) * discount
-        information = shared @ found.information
-        return DragInformation(0.5 * (information + information.T), shared @ found.vector, found.tips, at[:2] / speed)
+        self._learn_slide(found, corrections, discount)
+        shared = np.linalg.inv(EYE + found.information.dot(self._common(velocity))) * discount
+        information = shared.dot(found.information)
+        vector = shared.dot(found.vector)
+        return DragInformation(0.5 * (information + information.T), vector, found.tips, at[:2] / speed)
 
     def _trailing(self, contacts: Contacts, old: Contacts, span: float, velocity: FloatArray) -> TrailingTips | None:
         index = contacts.index
         rod = contacts.rod[:2]
         earlier = np.full((2, self._layout.count), np.nan)
         earlier[:, old.index] = old.rod[:2]
-        turning = (rod - earlier[:, index]) / span
-        p = self._layout.p_base[index, :2].T + rod
+        turning = (rod - earlier.take(index, axis=1)) / span
+        p = self._p_base.take(index, axis=1) + rod
         swept = swept_by(p, turning, velocity)
         speed = np.sqrt(swept[0] ** 2 + swept[1] ** 2)
         d = rod / -np.sqrt(rod[0] ** 2 + rod[1] ** 2)
@@ -154,10 +161,11 @@ class DragDirection:
             & (speed > self._settings.drag_least_speed)
             & (d[0] * swept[0] + d[1] * swept[1] > TRAILING * speed)
         )
-        if np.count_nonzero(ok) < LEAST_TIPS:
+        (of,) = ok.nonzero()
+        if len(of) < LEAST_TIPS:
             return None
-        gradient = self._slopes.gradient(contacts.points, index)
-        return TrailingTips(p[:, ok], turning[:, ok], d[:, ok], gradient[:, ok], swept[:, ok])
+        gradient = self._slopes.gradient(contacts.points, index, of)
+        return TrailingTips(p.take(of, 1), turning.take(of, 1), d.take(of, 1), gradient, swept.take(of, 1))
 
     def _information(self, tips: TrailingTips, at: FloatArray) -> FrameInformation:
         """What the tips say about the velocity's difference from its estimate, linearised at `at`."""
@@ -174,14 +182,6 @@ class DragDirection:
             float(sliding @ (weight * sliding)),
             float(sliding @ (weight * innovation)),
         )
-
-    @staticmethod
-    def _shown(found: FrameInformation, velocity: FloatArray, covariance: FloatArray) -> FloatArray:
-        """Direction of the motion as this frame shows it: scaled (vx, vy, wz) of length one."""
-        correction = np.linalg.solve(EYE + covariance @ found.information, covariance @ found.vector)
-        scaled = (velocity + correction) * METRIC
-        direction: FloatArray = scaled / max(math.sqrt(scaled @ scaled), 1e-9)
-        return direction
 
     def _linearised(
         self, tips: TrailingTips, swept: FloatArray
@@ -224,13 +224,11 @@ class DragDirection:
         common[2, 2] = turn**2 + (settings.drag_common_curvature * speed) ** 2
         return common
 
-    def _learn_slide(self, found: FrameInformation, covariance: FloatArray, discount: float) -> None:
+    def _learn_slide(self, found: FrameInformation, corrections: FloatArray, discount: float) -> None:
         """Estimate `slide` from how the tips of this frame differ; what they have in common is the velocity's."""
-        both = np.array([found.sliding_rows, found.vector]).T
-        to_velocity = np.linalg.solve(EYE + covariance @ found.information, covariance @ both)
-        shared = found.sliding_rows @ to_velocity
-        information = discount * max(found.sliding_sliding - float(shared[0]), 0.0)
-        vector = discount * (found.sliding_innovation - float(shared[1]))
+        innovation, sliding = found.sliding_rows.dot(corrections).tolist()
+        information = discount * max(found.sliding_sliding - sliding, 0.0)
+        vector = discount * (found.sliding_innovation - innovation)
         settings = self._settings
         # The ground changes: what was learned fades towards the prior.
         prior = settings.drag_sigma_slide**-2

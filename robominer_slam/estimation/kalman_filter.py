@@ -50,14 +50,18 @@ class KalmanFilter:
         PHT = self.P.dot(H.T)
         S = H.dot(PHT) + R
         single = len(innovation) == 1
+        solved: FloatArray | None = None
         if single:
             distance = float(innovation[0]) ** 2 / float(S[0, 0])
         else:
-            distance = float(innovation.dot(np.linalg.solve(S, innovation)))
+            # At once for the distance and the gain.
+            solved = np.linalg.solve(S, np.concatenate([innovation[:, None], PHT.T], axis=1))
+            distance = float(innovation.dot(solved[:, 0]))
         if distance > self.gate:
             self.outliers += 1
             S = S + R * (distance / self.gate - 1.0)
-        gain = PHT / S[0, 0] if single else np.linalg.solve(S, PHT.T).T
+            solved = None if single else np.linalg.solve(S, np.concatenate([innovation[:, None], PHT.T], axis=1))
+        gain = PHT / S[0, 0] if solved is None else solved[:, 1:].T
         if held is not None:
             # Any gain is allowed as long as the covariance follows it.
             gain = gain - held.T.dot(held.dot(gain))
