@@ -34,17 +34,20 @@ class LocalMap:
         rebuild: travel between two updates of the target, m.
     """
 
+    #: In the order of their age: places, shape (3, n), way driven when they were made, their cells.
+    _points: FloatArray
+    _travelled: FloatArray
+    _cells: NDArray[np.int64]
+    _built: float
+
     def __init__(
         self, model: SurfaceModel, keep: float, age: float, cell: float, per_cell: int, rebuild: float
     ) -> None:
         self._model = model
         self._keep, self._age = keep, age
         self._cell, self._per_cell, self._rebuild = cell, per_cell, rebuild
-        self._points = np.zeros((0, 3))
-        self._travelled = np.zeros(0)
         self._waiting: list[tuple[float, FloatArray]] = []
-        self._built = -np.inf
-        self.surface = Surface(self._points, model)
+        self.clear()
 
     def add(self, travelled: float, points: FloatArray) -> None:
         """Add touches in odom, shape (m, 3), m, made when `travelled` m had been driven."""
@@ -60,34 +63,54 @@ class LocalMap:
         if travelled - self._built < self._rebuild:
             return
         self._built = travelled
+        oldest = travelled - self._keep
+        leaving = int(np.searchsorted(self._travelled, oldest))
+        self._leave(self._cells[:leaving].tolist())
         ripe = 0
         while ripe < len(self._waiting) and self._waiting[ripe][0] <= travelled - self._age:
             ripe += 1
-        new, self._waiting = self._waiting[:ripe], self._waiting[ripe:]
-        points = np.concatenate([self._points, *(p for _, p in new)])
-        ages = np.concatenate([self._travelled, *(np.full(len(p), t) for t, p in new)])
-        young = ages >= travelled - self._keep
-        points, ages = points[young], ages[young]
-        kept = self._first_per_cell(points)
-        self._points, self._travelled = points[kept], ages[kept]
-        near = np.abs(self._points[:, :2] - centre).max(axis=1) <= radius
-        self.surface = Surface(self._points[near], self._model)
+        new, self._waiting = [one for one in self._waiting[:ripe] if one[0] >= oldest], self._waiting[ripe:]
+        points = np.concatenate([np.zeros((0, 3)), *(points for _, points in new)])
+        cells = self._cells_of(points)
+        kept = self._enter(cells.tolist())
+        made = np.concatenate([np.zeros(0), *(np.full(len(points), when) for when, points in new)])
+        self._points = np.concatenate([self._points[:, leaving:], points[kept].T], axis=1)
+        self._travelled = np.concatenate([self._travelled[leaving:], made[kept]])
+        self._cells = np.concatenate([self._cells[leaving:], cells[kept]])
+        (low_x, low_y), (high_x, high_y) = (centre - radius).tolist(), (centre + radius).tolist()
+        x, y, _ = self._points
+        (near,) = ((x >= low_x) & (x <= high_x) & (y >= low_y) & (y <= high_y)).nonzero()
+        self.surface = Surface(np.ascontiguousarray(self._points.take(near, axis=1).T), self._model)
 
     def clear(self) -> None:
         """Forget everything: after a jump of odom the old touches are elsewhere."""
-        self._points, self._travelled, self._waiting = np.zeros((0, 3)), np.zeros(0), []
+        self._points, self._travelled, self._cells = np.zeros((3, 0)), np.zeros(0), np.zeros(0, dtype=np.int64)
+        self._taken: dict[int, int] = {}
+        self._waiting = []
         self._built = -np.inf
-        self.surface = Surface(self._points, self._model)
+        self.surface = Surface(np.zeros((0, 3)), self._model)
 
-    def _first_per_cell(self, points: FloatArray) -> NDArray[np.intp]:
-        """Indices, ascending, of the first `per_cell` points of each cell; points are in the order of their age."""
-        if not len(points):
-            return np.zeros(0, dtype=np.intp)
+    def _cells_of(self, points: FloatArray) -> NDArray[np.int64]:
         ij = np.floor(points[:, :2] / self._cell).astype(np.int64)
-        key = ij[:, 0] * KEY_STRIDE + ij[:, 1]
-        order = np.argsort(key, kind="stable")
-        key = key[order]
-        # One is too many where the cell is that of the touch so many places before it.
-        kept = np.ones(len(points), dtype=np.bool_)
-        kept[order[self._per_cell :][key[self._per_cell :] == key[: -self._per_cell]]] = False
-        return np.flatnonzero(kept)
+        cells: NDArray[np.int64] = ij[:, 0] * KEY_STRIDE + ij[:, 1]
+        return cells
+
+    def _leave(self, cells: list[int]) -> None:
+        """Make room in the cells of touches that leave, a cell for each of them."""
+        taken = self._taken
+        for cell in cells:
+            left = taken[cell] - 1
+            if left:
+                taken[cell] = left
+            else:
+                del taken[cell]
+
+    def _enter(self, cells: list[int]) -> NDArray[np.intp]:
+        """Take touches into their cells, in the order of their age; which found room, ascending."""
+        taken, kept = self._taken, []
+        for k, cell in enumerate(cells):
+            here = taken.get(cell, 0)
+            if here < self._per_cell:
+                taken[cell] = here + 1
+                kept.append(k)
+        return np.array(kept, dtype=np.intp)
