@@ -67,7 +67,7 @@ def test_what_is_held_does_not_move_and_the_covariance_is_josephs(m: int) -> Non
 @pytest.mark.parametrize("fading", [1.0, 0.97])
 def test_a_prediction_is_filterpys(fading: float) -> None:
     rng, x, P = started(3)
-    inputs = Inputs(0.02, 0.3, np.array([0.2, -0.05]), np.array([[0.98, 0.05], [-0.02, 0.99]]))
+    inputs = Inputs(0.02, 0.3, np.array([0.2, -0.05]), ((0.98, 0.05), (-0.02, 0.99)))
     q, noise = rng.uniform(0.0, 1.0, N), MotionNoise(0.1, 0.05, 0.2, 0.3, 0.4)
     moved = step(x, inputs)
     F, effect = np.eye(N), np.zeros((N, 5))

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from array import array
-from dataclasses import dataclass, field
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,8 @@ from robominer_slam.float_array import of_floats
 FloatArray = NDArray[np.float64]
 
 X, Y, YAW, VX, VY, WZ, KEY_X, KEY_Y, KEY_YAW, SLOW = range(10)
-LEVEL = np.eye(2)
+LEVEL = ((1.0, 0.0), (0.0, 1.0))
+Pose: TypeAlias = tuple[float, float, float]
 REL, VELOCITY, KEY = slice(X, VX), slice(VX, KEY_X), slice(KEY_X, SLOW)
 #: Slow states with gyro and screws: bias of the gyro, slip (mean and varying part) of vx, vy, wz.
 GYRO_BIAS, SLIP_MEAN, SLIP = SLOW, slice(SLOW + 1, SLOW + 4), slice(SLOW + 4, SLOW + 7)
@@ -31,25 +32,23 @@ GYRO_BIAS, SLIP_MEAN, SLIP = SLOW, slice(SLOW + 1, SLOW + 4), slice(SLOW + 4, SL
 WINDOW_YAW = SLIP.stop
 
 
-@dataclass(frozen=True, slots=True)
-class Inputs:
+class Inputs(NamedTuple):
     """What moves the state in an interval.
 
     Attributes:
         dt: length of the interval, s.
         gyro: mean reading of the vertical gyro, rad/s; None: the turn rate walks.
         screws: vx, vy of the screws without slip, shape (2,), m/s; None: the velocity walks.
-        level: from body velocity (vx, vy) to its horizontal part ahead and to the left, shape (2, 2).
+        level: from body velocity (vx, vy) to its horizontal part ahead and to the left, row by row.
     """
 
     dt: float
     gyro: float | None = None
     screws: FloatArray | None = None
-    level: FloatArray = field(default_factory=lambda: LEVEL)
+    level: tuple[tuple[float, float], tuple[float, float]] = LEVEL
 
 
-@dataclass(frozen=True, slots=True)
-class MotionNoise:
+class MotionNoise(NamedTuple):
     """Covariance of what moves the state in an interval: xx, xy, yy of vx and vy, of wz, and of x and y beside them."""
 
     xx: float
@@ -59,8 +58,7 @@ class MotionNoise:
     position: float
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
+class Step(NamedTuple):
     """An interval's motion: the state after it, and derivatives of what moves, X to WZ (the other states stay).
 
     Attributes:
@@ -125,7 +123,7 @@ def step(state: FloatArray, inputs: Inputs) -> Step:
     dt = inputs.dt
     middle = values[YAW] + 0.5 * wz * dt
     c, s = math.cos(middle) * dt, math.sin(middle) * dt
-    (a, b), (d, e) = inputs.level.tolist()
+    (a, b), (d, e) = inputs.level
     ahead, left = a * vx + b * vy, d * vx + e * vy
     dx, dy = c * ahead - s * left, s * ahead + c * left
     values[X] += dx
@@ -154,11 +152,11 @@ def step(state: FloatArray, inputs: Inputs) -> Step:
     return Step(of_floats(values), np.frombuffer(F).reshape(6, n), (xx, xy, xw, yx, yy, yw), dt)
 
 
-def compose(state: FloatArray) -> FloatArray:
-    """Pose of the levelled base_link in odom (x, y, yaw), shape (3,): keyframe's pose times the pose since."""
+def compose(state: FloatArray) -> Pose:
+    """Pose of the levelled base_link in odom (x, y, yaw): keyframe's pose times the pose since."""
     x, y, yaw, _, _, _, key_x, key_y, key_yaw, *_ = state.tolist()
     c, s = math.cos(key_yaw), math.sin(key_yaw)
-    return of_floats([key_x + c * x - s * y, key_y + s * x + c * y, key_yaw + yaw])
+    return key_x + c * x - s * y, key_y + s * x + c * y, key_yaw + yaw
 
 
 def given_bias(state: FloatArray, P: FloatArray, bias: slice) -> tuple[FloatArray, FloatArray]:

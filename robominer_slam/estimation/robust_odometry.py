@@ -145,14 +145,11 @@ class RobustOdometry:
             return self._state
         x, P = self._filter.x, self._filter.P
         pose = compose(x)
-        x_odom, y_odom, yaw_odom = pose.tolist()
         J = compose_jacobian(x)
         covariance = J.dot(P).dot(J.T)
         self._state = OdometryState(
             stamp_ns,
-            x_odom,
-            y_odom,
-            yaw_odom,
+            *pose,
             x[VELOCITY].copy(),
             covariance,
             P[VELOCITY, VELOCITY].copy(),
@@ -239,7 +236,7 @@ class RobustOdometry:
             return
         before, self._screws_ns = self._screws_ns, stamp_ns
         settings, comparison = self._settings, self._comparison
-        screws = self._screw_matrix @ speed
+        screws = self._screw_matrix.dot(speed)
         vx, vy, wz, slip = screws.tolist()
         if math.hypot(vx, vy) > settings.fastest:
             self._stale += 1
@@ -292,7 +289,8 @@ class RobustOdometry:
                 screws = self._input
                 Q_linear = self._Q_input
         noise = MotionNoise(*Q_linear, turn_walk, settings.position_walk**2 * way)
-        ekf.move(Inputs(dt, gyro, screws, self._space.rotation[:2, :2]), noise)
+        (a, b, _), (c, d, _), _ = self._space.rotation
+        ekf.move(Inputs(dt, gyro, screws, ((a, b), (c, d))), noise)
         if walked:
             ekf.walk(*self._walk.take())
         self._space.advance(ekf.x[VELOCITY], dt)

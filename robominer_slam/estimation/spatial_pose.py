@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robominer_slam.configuration.robust_estimation_section import RobustEstimationSection
 from robominer_slam.estimation.imu_batch import ImuBatch
-from robominer_slam.estimation.tilt import Tilt, Vector
+from robominer_slam.estimation.tilt import Rotation, Tilt, Vector
 from robominer_slam.float_array import of_floats
 
 FloatArray = NDArray[np.float64]
 
 #: Rows of a twist (translation first) that the planar filter knows.
 PLANAR = [0, 1, 5]
-#: Up in the axes of a level body.
-LEVEL: Vector = (0.0, 0.0, 1.0)
+#: Of a level body.
+LEVEL: Rotation = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class SpatialPose:
@@ -28,7 +29,7 @@ class SpatialPose:
         tilts: False for a body without IMU: it is level.
 
     Attributes:
-        rotation: from base_link to its levelled frame, shape (3, 3).
+        rotation: from base_link to its levelled frame, row by row.
         z: in odom, m.
         way: driven so far, m.
     """
@@ -37,7 +38,7 @@ class SpatialPose:
         self._settings = settings
         self._tilt = Tilt(settings.tilt_time_constant) if tilts else None
         self._velocity = (0.0, 0.0)
-        self.rotation = np.eye(3)
+        self.rotation = LEVEL
         self.z = self.way = 0.0
         self._key = (self.rotation, self.z, self.way)
 
@@ -67,11 +68,11 @@ class SpatialPose:
     def advance(self, velocity: FloatArray, dt: float) -> None:
         """Go on by the body velocity (vx, vy, wz)."""
         vx, vy, _ = velocity.tolist()
-        up_x, up_y, _ = LEVEL if self._tilt is None else self._tilt.up
+        up_x, up_y, _ = self.rotation[2]
         self.way += math.hypot(vx, vy) * dt
         self.z += (up_x * vx + up_y * vy) * dt
 
-    def pose(self, planar: FloatArray) -> FloatArray | None:
+    def pose(self, planar: Sequence[float]) -> FloatArray | None:
         """Pose of base_link in odom, shape (4, 4), at (x, y, yaw); None for a level body."""
         return None if self._tilt is None else _pose(planar, self.z, self.rotation)
 
@@ -107,21 +108,21 @@ class SpatialPose:
             Pose of base_link in the keyframe (4, 4), covariance of its twist error (6, 6), derivative (6, nb).
         """
         rotation, z, way = self._key
-        T = _pose(planar, self.z - z, self.rotation)
-        T[:3] = rotation.T @ T[:3]
+        T = _pose(planar.tolist(), self.z - z, self.rotation)
+        T[:3] = np.array(rotation).T @ T[:3]
         jacobian = np.zeros((6, by_bias.shape[1]))
         jacobian[PLANAR] = by_bias
         # From the levelled frame to base_link.
-        to_base = np.kron(np.eye(2), self.rotation.T)
+        to_base = np.kron(np.eye(2), np.array(self.rotation).T)
         spatial = to_base @ self.covariance(covariance, self.way - way) @ to_base.T
         self._key = (self.rotation, self.z, self.way)
         return T, 0.5 * (spatial + spatial.T), to_base @ jacobian
 
 
-def _pose(planar: FloatArray, z: float, tilt: FloatArray) -> FloatArray:
-    x, y, yaw = planar.tolist()
+def _pose(planar: Sequence[float], z: float, rotation: Rotation) -> FloatArray:
+    x, y, yaw = planar
     c, s = math.cos(yaw), math.sin(yaw)
-    (ax, ay, az), (bx, by, bz), up = tilt.tolist()
+    (ax, ay, az), (bx, by, bz), up = rotation
     ahead = [c * ax - s * bx, c * ay - s * by, c * az - s * bz, x]
     left = [s * ax + c * bx, s * ay + c * by, s * az + c * bz, y]
     return of_floats([*ahead, *left, *up, z, 0.0, 0.0, 0.0, 1.0]).reshape(4, 4)

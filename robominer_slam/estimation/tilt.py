@@ -19,10 +19,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from robominer_slam.float_array import of_floats
-
 FloatArray = NDArray[np.float64]
 Vector: TypeAlias = tuple[float, float, float]
+Rotation: TypeAlias = tuple[Vector, Vector, Vector]
 
 GRAVITY = 9.81
 #: An acceleration that differs from gravity by more than this is a shock, m/s2.
@@ -102,14 +101,14 @@ class Tilt:
         x, y, z, w = orientation_xyzw.tolist()
         return 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
 
-    def rotation(self) -> FloatArray:
-        """From base_link to its levelled frame, Ry(pitch) Rx(roll), shape (3, 3)."""
+    def rotation(self) -> Rotation:
+        """From base_link to its levelled frame, Ry(pitch) Rx(roll), row by row."""
         ux, uy, uz = self.up
         cos_pitch = math.sqrt(uy * uy + uz * uz)
         sin_roll, cos_roll = uy / cos_pitch, uz / cos_pitch
         sin_pitch = -ux
-        ahead = [cos_pitch, sin_pitch * sin_roll, sin_pitch * cos_roll]
-        return of_floats([*ahead, 0.0, cos_roll, -sin_roll, ux, uy, uz]).reshape(3, 3)
+        ahead = cos_pitch, sin_pitch * sin_roll, sin_pitch * cos_roll
+        return ahead, (0.0, cos_roll, -sin_roll), self.up
 
     def turn_rate(self, rate: Vector) -> float:
         """Rate of the heading about the vertical, rad/s, for a body rate; the vertical bias is left in."""
