@@ -114,7 +114,7 @@ class AngleEstimator:
             field -= model.base_to_sensor @ ((R_map_base.T - np.eye(3)) @ self._earth_mT)
         if self._adds is None:
             tilt = self._evaluator.tilt(field)
-            inclination = np.sqrt(tilt[0] * tilt[0] + tilt[1] * tilt[1])
+            inclination = np.hypot(tilt[0], tilt[1])
             direction = _directions(tilt, inclination, usable)
         else:
             tilt, inclination, direction = self._without_neighbours(field, usable, self._adds)
@@ -130,7 +130,7 @@ class AngleEstimator:
         """Tilts (2, n) and inclinations (n,), rad, with the neighbours' magnets taken out, and directions (3, n)."""
         for _ in range(ITERATIONS):
             tilt = self._evaluator.tilt(field - self._added_mT)
-            inclination = np.sqrt(tilt[0] * tilt[0] + tilt[1] * tilt[1])
+            inclination = np.hypot(tilt[0], tilt[1])
             direction = _directions(tilt, inclination, usable)
             # Rods change little from frame to frame: most of what they add to each other may wait for its turn.
             step = direction - self._counted
@@ -140,18 +140,24 @@ class AngleEstimator:
                 more = step.T.reshape(-1).dot(adds.reshape(step.size, -1))
                 self._counted[:] = direction
             else:
-                rods, adding = self._blocks[self._turn]
-                self._turn = (self._turn + 1) % BLOCKS
-                more = adding.dot(step[:, rods].reshape(-1))
-                self._counted[:, rods] = direction[:, rods]
-                if len(quick):
-                    step = direction[:, quick] - self._counted[:, quick]
-                    more += step.T.reshape(-1).dot(adds[quick].reshape(3 * len(quick), -1))
-                    self._counted[:, quick] = direction[:, quick]
+                self._added_mT += self._next_block(step, direction)
+                if not len(quick):
+                    break
+                step = direction[:, quick] - self._counted[:, quick]
+                more = step.T.reshape(-1).dot(adds[quick].reshape(3 * len(quick), -1))
+                self._counted[:, quick] = direction[:, quick]
             self._added_mT += more.reshape(-1, 3)
             if np.maximum.reduce(np.abs(more)) < NEGLIGIBLE_MT:
                 break
         return tilt, inclination, direction
+
+    def _next_block(self, step: FloatArray, direction: FloatArray) -> FloatArray:
+        """What the rods whose turn it is add beyond what is counted of them, shape (n, 3), mT."""
+        rods, adding = self._blocks[self._turn]
+        self._turn = (self._turn + 1) % BLOCKS
+        self._counted[:, rods] = direction[:, rods]
+        more: FloatArray = adding.dot(step[:, rods].reshape(-1)).reshape(-1, 3)
+        return more
 
     def sigma(self, inclination: FloatArray) -> FloatArray:
         """One-sigma errors of the rods' directions at inclinations, shape (n,) each, rad."""

@@ -141,15 +141,15 @@ class PolynomialEvaluator:
     def tilt(self, field_mT: FloatArray) -> FloatArray:
         """Tilt vectors, shape (2, n), rad, of one field reading per whisker, shape (n, 3), mT."""
         # Whiskers last in memory too, not only in shape: the products below run along them.
-        u = np.multiply(field_mT.T, self._polarity, order="C")
-        square = u * u
-        transverse_square = square[0] + square[1]
-        strength = np.sqrt(transverse_square + square[2])
-        transverse = np.sqrt(np.maximum(transverse_square, 1e-18))
-        u[:2] *= np.arctan2(2.0 * transverse, u[2]) / transverse
-        u[2] = strength * self._inverse_strength - 1.0
         features = self._features
-        features[1:4] = u
+        u = features[1:4]
+        np.multiply(field_mT.T, self._polarity, out=u)
+        x, y, z = u
+        transverse = np.maximum(np.hypot(x, y), 1e-9)
+        strength = np.hypot(transverse, z)
+        u[:2] *= np.arctan2(2.0 * transverse, z) / transverse
+        np.multiply(strength, self._inverse_strength, out=z)
+        z -= 1.0
         for rows, first, second in self._steps:
             np.multiply(features.take(first, axis=0), features.take(second, axis=0), out=features[rows])
         tilt: FloatArray = np.einsum("otn,tn->on", self._coefficients, features)
