@@ -188,7 +188,7 @@ class Pipeline:
             self._feels.add_contacts(stamp, contacts)
             odometry = self._dead_reckoning.state_at(stamp)
         floor = self._points_down[contacts.index]
-        odometry = self._matched(stamp, odometry, contacts.points.compress(floor, axis=0))
+        odometry = self._matched(stamp, odometry, contacts.points, floor)
         T_odom_base = planar_pose(odometry)
         backend_results = self.runner.due(stamp) if self.runner is not None else []
         for result in backend_results:
@@ -211,7 +211,9 @@ class Pipeline:
             backend_results=backend_results,
         )
 
-    def _matched(self, stamp: int, odometry: OdometryState, points: FloatArray) -> OdometryState:
+    def _matched(
+        self, stamp: int, odometry: OdometryState, contacts: FloatArray, floor: NDArray[np.bool_]
+    ) -> OdometryState:
         """The odometry after matching the scan with the ground touched lately."""
         scans, reckoning = self._scan_odometry, self._takes_matches
         if scans is None or reckoning is None:
@@ -223,8 +225,10 @@ class Pipeline:
             # The ground touched before is far behind by now.
             scans.clear()
             self._unmatched = False
+        if not scans.moved(odometry.x, odometry.y, odometry.yaw):
+            return odometry
         level, tilt = geometry.levelled(planar_pose(odometry))
-        points = points @ tilt.T
+        points = contacts.compress(floor, axis=0).dot(tilt.T)
         covariance = np.zeros((4, 4))
         covariance[:3, :3] = reckoning.relative_covariance()
         covariance[3, 3] = HEIGHT_SIGMA_M**2

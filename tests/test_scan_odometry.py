@@ -42,7 +42,8 @@ def drive(height, *, matching: bool, seconds: float = 30.0, seed: int = 4) -> Dr
         if matching:
             covariance = np.zeros((4, 4))
             covariance[:3, :3], covariance[3, 3] = odometry.relative_covariance(), 0.002**2
-            correction = scans.match(np.array([state.x, state.y, state.yaw, 0.0]), covariance, points)
+            predicted = np.array([state.x, state.y, state.yaw, 0.0])
+            correction = scans.match(predicted, covariance, points) if scans.moved(*predicted[:3]) else None
             if correction is not None:
                 odometry.correct_pose(stamp, correction.offset, correction.information)
                 state = odometry.state_at(stamp)
@@ -72,7 +73,7 @@ def scans_on(height, rng, **changes) -> ScanOdometry:
     scans = ScanOdometry(ScanMatchingSection(**{"step": 0.001, "age": 0.0, "rebuild": 0.0, **changes}), MODEL, 0.6)
     for k in range(30):
         pose = np.array([0.002 * k, 0.0, 0.0, 0.0])
-        scans.match(pose, np.eye(4) * 1e-6, np.zeros((0, 3)))
+        scans.moved(*pose[:3])
         scans.add(pose, touches(height, rng, 60, HALF, pose[:3], noise=4e-4))
     return scans
 
@@ -122,12 +123,13 @@ def test_few_contacts_other_ground_and_standing_still_give_no_match():
     moving = scans_on(rough(1), rng, step=0.02)
     pose[0] = 0.065
     moving.add(pose, points)
-    assert moving.match(pose + 0.019 * ALONG, covariance, points) is None
+    assert not moving.moved(0.065 + 0.019, 0.0, 0.0)
+    assert moving.moved(0.065 + 0.021, 0.0, 0.0)
     assert moving.match(pose + 0.021 * ALONG, covariance, points) is not None
 
 
 def test_turning_on_the_spot_counts_as_way():
     scans = ScanOdometry(ScanMatchingSection(), MODEL, 0.4)
     for yaw in np.linspace(3.0, 3.0 + 2 * np.pi, 100):
-        scans.match(np.array([0.0, 0.0, geometry.wrap_angle(yaw), 0.0]), np.eye(4), np.zeros((0, 3)))
+        scans.moved(0.0, 0.0, float(geometry.wrap_angle(yaw)))
     assert scans.travelled == pytest.approx(0.15 * 2 * np.pi, rel=1e-6)

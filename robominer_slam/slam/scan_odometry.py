@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,8 @@ from robominer_slam.slam.surface import SurfaceModel
 from robominer_slam.slam.surface_registration import YAW, SurfaceMatch, Z, fit, height_left_free, placed
 
 FloatArray = NDArray[np.float64]
+#: x, y (m), yaw (rad) in odom.
+Pose: TypeAlias = tuple[float, float, float]
 
 #: Fewer contacts are not worth a match.
 LEAST_CONTACTS = 8
@@ -66,23 +69,30 @@ class ScanOdometry:
         self._map = LocalMap(
             model, parameters.keep, parameters.age, parameters.cell, parameters.per_cell, parameters.rebuild
         )
-        self._last: FloatArray | None = None
-        self._before: FloatArray | None = None
+        self._last: Pose | None = None
+        self._before: Pose | None = None
         self.matches = 0
         self.travelled = 0.0
         self.breaks = 0
         self._misfits = 0
 
+    def moved(self, x: float, y: float, yaw: float) -> bool:
+        """Go on to a pose in odom, m and rad; whether it is far enough from the last match for another."""
+        pose = x, y, yaw
+        if self._before is not None:
+            self.travelled += _way(self._before, pose)
+        self._before = pose
+        return self._due(pose)
+
     def match(self, pose: FloatArray, covariance: FloatArray, points: FloatArray) -> ScanCorrection | None:
-        """Match a frame, if the robot has moved far enough since the last.
+        """Match a frame at a pose that the robot has `moved` to.
 
         Args:
             pose: predicted x, y, yaw, z in odom, shape (4,).
             covariance: of it since the reference that the map hangs on, shape (4, 4).
             points: contacts in base_link, levelled, shape (m, 3), m.
         """
-        self._travel(pose)
-        if len(points) < LEAST_CONTACTS or not self._due(pose):
+        if len(points) < LEAST_CONTACTS:
             return None
         self._map.update(self.travelled, pose[:2], self._reach)
         if not len(self._map.surface):
@@ -109,9 +119,10 @@ class ScanOdometry:
 
     def add(self, pose: FloatArray, points: FloatArray) -> None:
         """Put a frame's contacts (in base_link, levelled) into the map at its corrected pose (x, y, yaw, z)."""
-        if not self._due(pose):
+        x, y, yaw, _ = pose.tolist()
+        if not self._due((x, y, yaw)):
             return
-        self._last = pose.copy()
+        self._last = x, y, yaw
         if len(points):
             self._map.add(self.travelled, placed(points, pose))
 
@@ -133,19 +144,14 @@ class ScanOdometry:
         self.clear()
         return True
 
-    def _travel(self, pose: FloatArray) -> None:
-        if self._before is not None:
-            self.travelled += _way(self._before, pose)
-        self._before = pose.copy()
-
-    def _due(self, pose: FloatArray) -> bool:
+    def _due(self, pose: Pose) -> bool:
         return self._last is None or _way(self._last, pose) >= self._parameters.step
 
 
-def _way(a: FloatArray, b: FloatArray) -> float:
-    """From one pose (x, y, yaw, ...) to the other as the whiskers go, m."""
-    x_a, y_a, yaw_a, *_ = a.tolist()
-    x_b, y_b, yaw_b, *_ = b.tolist()
+def _way(a: Pose, b: Pose) -> float:
+    """From one pose to the other as the whiskers go, m."""
+    x_a, y_a, yaw_a = a
+    x_b, y_b, yaw_b = b
     return math.hypot(x_b - x_a, y_b - y_a) + TURN_ARM * abs(math.remainder(yaw_b - yaw_a, math.tau))
 
 
