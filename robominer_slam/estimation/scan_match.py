@@ -31,7 +31,7 @@ def match_measurement(
         information: of it, shape (3, 3).
     """
     to_key = _odom_from_key(x).T
-    values, vectors = np.linalg.eigh(to_key @ information @ to_key.T)
+    values, vectors = np.linalg.eigh(to_key.dot(information).dot(to_key.T))
     told = values > LEAST_INFORMATION
     if not told.any():
         return None
@@ -45,7 +45,7 @@ def match_measurement(
 def relative_covariance(x: FloatArray, P: FloatArray) -> FloatArray:
     """Covariance of (x, y, yaw) since the last keyframe, in odom's axes, shape (3, 3)."""
     R = _odom_from_key(x)
-    return np.asarray(R @ P[REL, REL] @ R.T)
+    return np.asarray(R.dot(P[REL, REL]).dot(R.T))
 
 
 def _odom_from_key(x: FloatArray) -> FloatArray:

@@ -27,6 +27,8 @@ Pose: TypeAlias = tuple[float, float, float]
 LEAST_CONTACTS = 8
 #: Turning by 1 rad moves the whiskers by about this, m: travel counts both.
 TURN_ARM = 0.15
+#: Of the best known direction's information: a direction with less has none.
+LEAST_SHARE = 1e-9
 #: So many matches in a row in which less than this share fits, each over ground known to the other share, are a
 #: break: on the thesis's ground the best of five never had less than 0.74, after being carried 0.3 to 0.66.
 BREAK_MISFITS = 5
@@ -110,10 +112,10 @@ class ScanOdometry:
         # The touches' noise pulls at d as much as H says, whatever of H the slopes' errors have made up: with
         # H0 d = -g, the information of d is H0 H^-1 H0.
         known, apparent = height_left_free(found.information), height_left_free(found.curvature)
-        information = known @ np.linalg.solve(apparent + 1e-9 * np.eye(3), known) * self._parameters.share
+        information = known.dot(np.linalg.solve(apparent + 1e-9 * np.eye(3), known)) * self._parameters.share
         # The least-squares offset of the touches alone: H d = -g at the predicted pose.
         H = found.curvature
-        gradient = found.gradient - H @ offset
+        gradient = found.gradient - H.dot(offset)
         reduced = gradient[:3] - H[:3, Z] * gradient[Z] / max(H[Z, Z], 1e-12)
         return ScanCorrection(_least(known, -reduced), information)
 
@@ -157,4 +159,8 @@ def _way(a: Pose, b: Pose) -> float:
 
 def _least(information: FloatArray, right_side: FloatArray) -> FloatArray:
     """Shortest solution of H d = b: directions without information stay where they are."""
-    return np.asarray(np.linalg.lstsq(information, right_side, rcond=1e-9)[0], dtype=np.float64)
+    values, vectors = np.linalg.eigh(information)
+    known = values > LEAST_SHARE * values[-1]
+    along = vectors.T.dot(right_side)
+    solution: FloatArray = vectors.dot(np.divide(along, values, out=np.zeros(len(values)), where=known))
+    return solution

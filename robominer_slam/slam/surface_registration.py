@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from robominer_slam.float_array import of_floats
 from robominer_slam.geometry import wrap_angle
 from robominer_slam.slam.surface import Surface
 
@@ -77,12 +78,11 @@ class SurfaceMatch:
 
 def placed(points: FloatArray, pose: FloatArray) -> FloatArray:
     """Points (m, 3) of a frame at `pose` (x, y, yaw, z) in the other frame, m."""
-    c, s = math.cos(pose[YAW]), math.sin(pose[YAW])
-    x, y = points[:, 0], points[:, 1]
-    q = np.empty((len(points), 3))
-    q[:, 0] = c * x - s * y + pose[X]
-    q[:, 1] = s * x + c * y + pose[Y]
-    q[:, 2] = points[:, 2] + pose[Z]
+    x, y, yaw, z = pose.tolist()
+    c, s = math.cos(yaw), math.sin(yaw)
+    # Points are rows: the rotation is its transpose.
+    q: FloatArray = points.dot(of_floats([c, s, 0.0, -s, c, 0.0, 0.0, 0.0, 1.0]).reshape(3, 3))
+    q += of_floats([x, y, z])
     return q
 
 
@@ -194,7 +194,8 @@ def _without_lost(
 
 def height_left_free(H: FloatArray) -> FloatArray:
     """Information about (x, y, yaw), shape (3, 3), of one about (x, y, yaw, z): the Schur complement of z."""
-    planar: FloatArray = H[:3, :3] - np.outer(H[:3, Z], H[Z, :3]) / max(float(H[Z, Z]), 1e-12)
+    along_z = H[:3, Z]
+    planar: FloatArray = H[:3, :3] - along_z[:, None] * (along_z / max(float(H[Z, Z]), 1e-12))
     return planar
 
 
