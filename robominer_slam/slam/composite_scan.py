@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple, TypeAlias
+
 import numpy as np
 import small_gicp
 from numpy.typing import NDArray
@@ -10,6 +13,7 @@ from robominer_slam import geometry
 from robominer_slam.slam.keyframe import Keyframe
 
 FloatArray = NDArray[np.float64]
+Vector: TypeAlias = tuple[float, float, float]
 
 #: A scan taken where the robot already stood adds nothing but its noise: standing still must not fill the memory.
 MIN_MOVE_M = 0.002
@@ -24,6 +28,14 @@ def voxel_filter(points: FloatArray, voxel: float) -> FloatArray:
         return points
     sampled: FloatArray = np.asarray(small_gicp.voxelgrid_sampling(points, voxel).points(), dtype=np.float64)[:, :3]
     return sampled
+
+
+class Stance(NamedTuple):
+    """A pose of base_link in odom in plain floats: position, m, and where its x and y axes point."""
+
+    position: Vector
+    ahead: Vector
+    left: Vector
 
 
 class CompositeScan:
@@ -43,9 +55,9 @@ class CompositeScan:
         self._scans: list[FloatArray] = []
         self._floor: list[NDArray[np.bool_]] = []
         self._count = 0
-        self._start: FloatArray | None = None
-        self._last: FloatArray | None = None
-        self._added: FloatArray | None = None
+        self._start: Stance | None = None
+        self._last: Stance | None = None
+        self._added: Stance | None = None
         self._travelled = 0.0
         self._next_id = first_id
         self.dropped_points = 0
@@ -64,12 +76,13 @@ class CompositeScan:
         Returns:
             The keyframe that this scan completes, or None.
         """
+        here = _stance(T_odom_base)
         if self._last is None or self._start is None:
-            self._start = self._last = T_odom_base
-        self._travelled += float(np.linalg.norm(T_odom_base[:3, 3] - self._last[:3, 3]))
-        self._last = T_odom_base
-        if len(points) and self._moved(T_odom_base):
-            self._added = T_odom_base
+            self._start = self._last = here
+        self._travelled += math.dist(here.position, self._last.position)
+        self._last = here
+        if len(points) and self._moved(here):
+            self._added = here
             scan = voxel_filter(points, self._voxel)
             if self._count + len(scan) > MAX_POINTS:
                 self.dropped_points += len(scan)
@@ -78,9 +91,9 @@ class CompositeScan:
                 if floor is not None and self._voxel <= 0.0:
                     self._floor.append(floor)
                 self._count += len(scan)
-        if not self._complete(T_odom_base):
+        if not self._complete(here):
             return None
-        self._start = T_odom_base
+        self._start = here
         if not self._scans:
             return None
         odom_points = np.concatenate(self._scans)
@@ -102,21 +115,27 @@ class CompositeScan:
         self._scans, self._floor, self._count = [], [], 0
         self._start = self._added = None
 
-    def _moved(self, T_odom_base: FloatArray) -> bool:
-        if self._added is None:
+    def _moved(self, here: Stance) -> bool:
+        added = self._added
+        if added is None:
             return True
-        step = T_odom_base[:3, 3] - self._added[:3, 3]
-        return bool(np.linalg.norm(step) >= MIN_MOVE_M) or _turn(self._added, T_odom_base) >= MIN_TURN_RAD
+        return math.dist(here.position, added.position) >= MIN_MOVE_M or _turn(added, here) >= MIN_TURN_RAD
 
-    def _complete(self, T_odom_base: FloatArray) -> bool:
+    def _complete(self, here: Stance) -> bool:
         start = self._start
         if start is None:
             return False
-        moved = np.abs(T_odom_base[:2, 3] - start[:2, 3]).max()
-        return bool(moved >= self._distance) or _turn(start, T_odom_base) >= self._angle
+        (x, y, _), (from_x, from_y, _) = here.position, start.position
+        return max(abs(x - from_x), abs(y - from_y)) >= self._distance or _turn(start, here) >= self._angle
 
 
-def _turn(T_a: FloatArray, T_b: FloatArray) -> float:
+def _stance(T: FloatArray) -> Stance:
+    (ahead_x, left_x, _, x), (ahead_y, left_y, _, y), (ahead_z, left_z, _, z), _ = T.tolist()
+    return Stance((x, y, z), (ahead_x, ahead_y, ahead_z), (left_x, left_y, left_z))
+
+
+def _turn(a: Stance, b: Stance) -> float:
     """Heading change between two poses, rad, 0 to pi."""
-    relative = T_a[:3, :3].T @ T_b[:3, :3]
-    return float(abs(np.arctan2(relative[1, 0], relative[0, 0])))
+    x, y, z = b.ahead
+    (ahead_x, ahead_y, ahead_z), (left_x, left_y, left_z) = a.ahead, a.left
+    return abs(math.atan2(left_x * x + left_y * y + left_z * z, ahead_x * x + ahead_y * y + ahead_z * z))
