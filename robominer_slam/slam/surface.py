@@ -26,6 +26,12 @@ NEIGHBOURS = 10
 LEAST_NEIGHBOURS = 4
 #: Of a plane: so many of the residuals go into the fit itself.
 UNKNOWNS = 3
+#: Symmetric matrices (3, 3) are kept as six entries, row by row from the diagonal on: where the diagonal is, and where
+#: each entry of the whole is. A cofactor is the product of the first and second less that of the third and fourth.
+DIAGONAL = [0, 3, 5]
+WHOLE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+FIRST, SECOND = np.array([3, 4, 1, 0, 1, 0]), np.array([5, 2, 4, 5, 2, 3])
+THIRD, FOURTH = np.array([4, 1, 2, 2, 0, 1]), np.array([4, 5, 3, 2, 4, 1])
 #: A few touches may lie in a plane by chance: their misfit, in variances, counts as no less.
 LEAST_MISFIT = 0.1
 
@@ -103,9 +109,9 @@ class Surface:
         self.points = points
         self._model = model
         self._tree = cKDTree(points[:, :2], balanced_tree=False, compact_nodes=False) if len(points) else None
-        # By coordinates, and one more: where the search finds too few touches, it tells an index past the end.
-        self._columns = np.zeros((3, len(points) + 1))
-        self._columns[:, :-1] = points.T
+        # And one more: where the search finds too few touches, it tells an index past the end.
+        self._rows = np.zeros((len(points) + 1, 3))
+        self._rows[:-1] = points
 
     def __len__(self) -> int:
         return len(self.points)
@@ -124,45 +130,35 @@ class Surface:
         squared = np.ascontiguousarray(np.transpose(distance)) ** 2
         count = (squared < np.inf).sum(axis=0, dtype=np.int8)
         weight = 1.0 / (model.touch_sigma**2 + np.square(model.curvature * squared))
-        offset = self._columns.take(np.transpose(index), axis=1)
+        offset = np.ascontiguousarray(self._rows.take(np.transpose(index), axis=0).transpose(2, 0, 1))
         # Heights are taken relative to the nearest touch: the regression's numbers stay small.
         datum = offset[2, 0].copy()
         offset[:2] -= xy.T[:, None]
         offset[2] -= datum
-        weighted = offset[:2] * weight
-        s_x, s_y = weighted.sum(axis=1)
-        xx, xy_, xz = np.einsum("km,akm->am", weighted[0], offset)
-        yy, yz = np.einsum("km,akm->am", weighted[1], offset[1:])
-        weighted_z = weight * offset[2]
-        s_z = weighted_z.sum(axis=0)
-        zz = np.einsum("km,km->m", weighted_z, offset[2])
-        # The normal equations' matrix with the prior in it, and its inverse by cofactors.
-        height_prior = 1e-6 / model.touch_sigma**2
-        s = weight.sum(axis=0) + height_prior
-        xx += prior
-        yy += prior
-        c_0 = xx * yy - xy_ * xy_
-        c_x = xy_ * s_y - s_x * yy
-        c_y = s_x * xy_ - s_y * xx
-        by_determinant = 1.0 / (s * c_0 + s_x * c_x + s_y * c_y)
-        slope_covariance = np.empty((3, m))
-        slope_covariance[0] = s * yy - s_y * s_y
-        slope_covariance[1] = s_x * s_y - s * xy_
-        slope_covariance[2] = s * xx - s_x * s_x
-        slope_covariance *= by_determinant
-        c_0, c_x, c_y = c_0 * by_determinant, c_x * by_determinant, c_y * by_determinant
-        height = c_0 * s_z + c_x * xz + c_y * yz
-        slope = np.empty((m, 2))
-        slope[:, 0] = c_x * s_z + slope_covariance[0] * xz + slope_covariance[1] * yz
-        slope[:, 1] = c_y * s_z + slope_covariance[1] * xz + slope_covariance[2] * yz
+        weighted = offset * weight
+        # The normal equations' matrix and its right side, of height and slopes along x and y.
+        M, right_side = np.empty((6, m)), np.empty((3, m))
+        weight.sum(axis=0, out=M[0])
+        weighted[:2].sum(axis=1, out=M[1:3])
+        weighted[2].sum(axis=0, out=right_side[0])
+        M[3], M[4], right_side[1] = np.einsum("km,akm->am", weighted[0], offset)
+        M[5], right_side[2] = np.einsum("km,akm->am", weighted[1], offset[1:])
+        zz = np.einsum("km,km->m", weighted[2], offset[2])
+        prior_of = np.array([[1e-6 / model.touch_sigma**2], [prior], [prior]])
+        M[DIAGONAL] += prior_of
+        # Its inverse by cofactors.
+        inverse = M.take(FIRST, axis=0) * M.take(SECOND, axis=0)
+        inverse -= M.take(THIRD, axis=0) * M.take(FOURTH, axis=0)
+        inverse /= np.einsum("am,am->m", M[:3], inverse[:3])
+        plane = np.einsum("abm,bm->am", inverse.take(WHOLE, axis=0), right_side)
         # What the plane f leaves of the weighted squares: z'Wz - f'X'Wz, without what the prior pulls f by.
-        chi2 = zz - height * (s_z + height_prior * height)
-        chi2 -= slope[:, 0] * (xz + prior * slope[:, 0]) + slope[:, 1] * (yz + prior * slope[:, 1])
+        chi2 = zz - np.einsum("am,am->m", plane, right_side + prior_of * plane)
         np.maximum(chi2, 0.0, out=chi2)
+        height, slope, slope_covariance = plane[0], np.ascontiguousarray(plane[1:].T), inverse[3:]
         known = count >= LEAST_NEIGHBOURS
         # A step must show here, four touches that are off their plane by chance must not: the mean over the touches.
         steps = np.maximum(chi2 / np.maximum(count - 1, 1), 1.0)
-        variance = c_0 * steps + model.touch_sigma**2
+        variance = inverse[0] * steps + model.touch_sigma**2
         misfit = chi2 / np.maximum(count - UNKNOWNS, 1)
         return SurfacePatches(
             known, np.where(known, datum + height, 0.0), slope, variance, slope_covariance, misfit, prior
