@@ -49,6 +49,13 @@ class RobustEstimationSection(Section):
     drag_least_speed: float = parameter(
         0.02, "m/s", "of a tip: slower, its direction of motion is not known well", low=0.001, high=1.0
     )
+    standstill: bool = parameter(
+        True, "", "a ready-made odometry counts as motion only unless the whiskers feel that the robot stands"
+    )
+    rest_deg: float = parameter(
+        0.75, "deg", "rods that turn less in 0.4 s may rest: noise alone is 0.5, at 0.15 m/s they turn by 2 to 6",
+        low=0.05, high=10.0,
+    )  # fmt: skip
     acceleration_walk: float = parameter(
         0.15, "m/s2/sqrt(Hz)", "0.2 m/s2 for some tenths of a second at a time", low=0.01, high=10.0
     )

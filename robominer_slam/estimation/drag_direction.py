@@ -87,6 +87,11 @@ class DragDirection:
         #: Estimated angle by which a cross slope turns a rod, rad per slope.
         self.slide = settings.drag_slide
 
+    @property
+    def whiskers(self) -> int:
+        """How many the array has."""
+        return self._layout.count
+
     def measure(
         self, stamp_ns: int, contacts: Contacts, velocity: FloatArray, covariance: FloatArray
     ) -> DragInformation | None:
