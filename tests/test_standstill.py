@@ -18,6 +18,13 @@ FRAME, SAMPLE = 40_000_000, 33_333_333
 ROUGH, FLAT = 0.03, 1e9
 
 
+def touching(inclination) -> Contacts:
+    """All rods trail behind at these inclinations."""
+    n = len(inclination)
+    rod = 0.15 * np.array([-np.sin(inclination), np.zeros(n), -np.cos(inclination)])
+    return Contacts(np.zeros((n, 3)), np.arange(n), inclination, np.full(n, np.pi), rod)
+
+
 def stands(_t: float) -> float:
     return 0.0
 
@@ -30,7 +37,6 @@ def drive(speed, seconds: float, ground: float = ROUGH, noise: float = 1.0, sile
     settings = RobustEstimationSection(drag_least_speed=1.0)
     odometry = RobustOdometry(settings, "odometry", DragDirection(settings, layout), np.eye(4))
     phase = rng.uniform(0.0, 2.0 * np.pi, 64)
-    azimuth = np.full(64, np.pi)
     true_way, way = 0.0, {}
     for t in range(0, round(seconds * 1000), 1):
         true_way += speed(t / 1000) / 1000
@@ -46,8 +52,7 @@ def drive(speed, seconds: float, ground: float = ROUGH, noise: float = 1.0, sile
             odometry.add(OdometrySample(stamp, velocity))
         elif not silent:
             inclination = 0.5 + 0.1 * np.sin(x / ground + phase) + rng.normal(0.0, 0.004, 64)
-            points = np.zeros((64, 3))
-            odometry.add_contacts(stamp, Contacts(points, np.arange(64), inclination, azimuth))
+            odometry.add_contacts(stamp, touching(inclination))
             odometry.state_at(stamp)
     state = odometry.state_at(round(seconds * 1e9))
     return np.array([state.x, state.y, state.yaw]), true_way, odometry
@@ -90,7 +95,7 @@ def test_wheels_that_say_exactly_nothing_teach_no_bias():
     settings = RobustEstimationSection(drag_least_speed=1.0)
     layout = layouts.thesis_grid()
     odometry = RobustOdometry(settings, "odometry", DragDirection(settings, layout), np.eye(4))
-    contacts = Contacts(np.zeros((64, 3)), np.arange(64), np.full(64, 0.5), np.zeros(64))
+    contacts = touching(np.full(64, 0.5))
     for k in range(1, 600):
         odometry.add(OdometrySample(k * SAMPLE, np.zeros(3)))
         odometry.add_contacts(k * SAMPLE, contacts)

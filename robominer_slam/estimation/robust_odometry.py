@@ -5,8 +5,7 @@ Both sources share pose, velocity and the drag of the whiskers (`drag_direction`
 - `fused`: the gyro is an input and its bias a state; the screws measure the velocity, of which slip takes a share:
   screws = v / (1 - slip), slip = mean + varying part per axis, the latter a Gauss-Markov process in the distance
   driven. Screws that stand measure a velocity of zero.
-- `odometry`: its samples measure the velocity plus a bias per axis and white noise; nothing else is used. While the
-  whiskers feel that the robot stands (`standstill`), the pose stays and the samples tell the biases alone.
+- `odometry`: its samples measure the velocity plus a bias per axis and white noise (`ready_made_odometry`).
 """
 
 from __future__ import annotations
@@ -38,11 +37,11 @@ from robominer_slam.estimation.planar_motion import (
     motion_ahead,
 )
 from robominer_slam.estimation.planar_start import MATCH_STATES, ODOMETRY_BIAS
+from robominer_slam.estimation.ready_made_odometry import ReadyMadeOdometry
 from robominer_slam.estimation.scan_match import match_measurement, relative_covariance
 from robominer_slam.estimation.screw_speeds import MAX_INTERVAL_S, ScrewAngleSpeeds, ScrewSpeedAssembly
 from robominer_slam.estimation.slow_walk import SlowWalk
 from robominer_slam.estimation.spatial_pose import SpatialPose
-from robominer_slam.estimation.standstill import OdometryReading, Standstill
 from robominer_slam.estimation.turn_comparison import TurnComparison
 
 FloatArray = NDArray[np.float64]
@@ -81,7 +80,6 @@ class RobustOdometry:
         self._walk = SlowWalk(settings, fused, self._match, variance[self._match].tolist())
         self._bias = slice(GYRO_BIAS, GYRO_BIAS + 1) if fused else ODOMETRY_BIAS
         self._filter = PlanarFilter(x, np.diag(variance), settings.gate)
-        self._H_odometry = planar_start.odometry_rows()
         self._R_screws = (screw_matrix[:3] @ screw_matrix[:3].T) * settings.sigma_screw_speed**2
         self._R_linear: list[float] = self._R_screws[:2, :2].ravel().tolist()
         self._speeds = ScrewSpeedAssembly()
@@ -93,10 +91,8 @@ class RobustOdometry:
         self._stamp_ns: int | None = None
         self._marked_ns: int | None = None
         self._angles = ScrewAngleSpeeds(LEAST_SCREW_INTERVAL_NS)
-        self._odometry_ns: int | None = None
-        self._standstill: Standstill | None = None
-        if drag is not None and not fused and settings.standstill:
-            self._standstill = Standstill(settings, drag.whiskers)
+        feels = drag.whiskers if drag is not None and settings.standstill else None
+        self._odometry = ReadyMadeOdometry(settings, self._filter, feels, self._predict, self._rest_until)
         self._screws_ns: int | None = None
         self._input = np.zeros(2)
         #: Covariance of the screws' vx, vy: xx, xy, yy.
@@ -109,7 +105,7 @@ class RobustOdometry:
         self._state = None
         if self._source == "odometry":
             if isinstance(measurement, OdometrySample):
-                self._add_odometry(measurement)
+                self._odometry.add(measurement)
             return
         match measurement:
             case ImuSample():
@@ -123,8 +119,9 @@ class RobustOdometry:
         """Take the contacts of a whisker frame; `state_at` then knows of them."""
         if self._drag is None:
             return
-        if self._standstill is not None:
-            self._feel_standstill(self._standstill, stamp_ns, contacts)
+        if self._source == "odometry":
+            self._state = None
+            self._odometry.feel(stamp_ns, contacts)
         self._go_on(stamp_ns)
         ekf = self._filter
         found = self._drag.measure(stamp_ns, contacts, ekf.x[VELOCITY], ekf.P[VELOCITY, VELOCITY])
@@ -216,79 +213,16 @@ class RobustOdometry:
     @property
     def stale(self) -> int:
         """Measurements of motion left out: out of order, after a gap, or faster than the robot is."""
-        return self._stale + self._angles.stale
+        return self._stale + self._angles.stale + self._odometry.stale
 
     @property
     def outliers(self) -> int:
         """Measurements beyond the gate."""
         return self._filter.outliers
 
-    def _add_odometry(self, sample: OdometrySample) -> None:
-        previous, self._odometry_ns = self._odometry_ns, sample.stamp_ns
-        if previous is None:
-            return
-        interval = (sample.stamp_ns - previous) * 1e-9
-        if not 0.0 < interval <= MAX_INTERVAL_S:
-            self._stale += 1
-            return
-        reading = OdometryReading(sample.stamp_ns, interval, sample.velocity)
-        standstill = self._standstill
-        if standstill is None:
-            self._take_motion(reading)
-            return
-        standstill.add(reading, *self._odometry_bias())
-        self._take_sorted(standstill)
-
-    def _feel_standstill(self, standstill: Standstill, stamp_ns: int, contacts: Contacts) -> None:
-        """Look whether the whiskers rest: the robot may have stopped, or what was taken for standing was motion."""
-        if standstill.see(stamp_ns, contacts, *self._odometry_bias()):
-            self._stand()
-        self._take_sorted(standstill)
-
-    def _take_sorted(self, standstill: Standstill) -> None:
-        sorted_ = standstill.sorted()
-        for reading in sorted_.stood:
-            self._take_standing(reading)
-        if sorted_.rested:
-            self._stamp_ns = sorted_.rested[-1].stamp_ns
-            self._stand()
-        for reading in sorted_.moved:
-            self._take_motion(reading)
-
-    def _stand(self) -> None:
-        """Begin anew with a velocity of zero; what the velocity before told of the biases stays as it is.
-
-        As a measurement, the last creeping before a stop, or the first after it, would pull the biases along.
-        """
-        self._state = None
-        ekf = self._filter
-        ekf.x[VELOCITY] = 0.0
-        ekf.P[VELOCITY] = 0.0
-        ekf.P[:, VELOCITY] = 0.0
-        ekf.P[VELOCITY, VELOCITY] = np.eye(3) * self._settings.sigma_still**2
-
-    def _take_motion(self, reading: OdometryReading) -> None:
-        """Take a reading of the odometry: a mean over the interval, which holds for its middle."""
-        self._state = None
-        self._predict(reading.stamp_ns - round(0.5e9 * reading.interval))
-        self._measure_odometry(reading)
-
-    def _take_standing(self, reading: OdometryReading) -> None:
-        """Take a reading made while the robot stood: it tells the biases."""
-        self._stamp_ns = reading.stamp_ns
-        self._stand()
-        # An odometry that says nothing at all while the robot stands, as wheels do, has another bias when it moves.
-        if reading.velocity.any():
-            self._measure_odometry(reading)
-
-    def _measure_odometry(self, reading: OdometryReading) -> None:
-        variance = self._settings.sigma_odometry**2 / (30.0 * reading.interval)
-        innovation = reading.velocity - self._H_odometry @ self._filter.x
-        self._filter.correct(innovation, self._H_odometry, variance * np.eye(3))
-
-    def _odometry_bias(self) -> tuple[FloatArray, FloatArray]:
-        """Biases of the ready-made odometry and their variances, shape (3,) each."""
-        return self._filter.x[ODOMETRY_BIAS], np.diag(self._filter.P)[ODOMETRY_BIAS]
+    def _rest_until(self, stamp_ns: int) -> None:
+        """Let time pass while the robot stands."""
+        self._stamp_ns = stamp_ns
 
     def _take_speed(self, stamp_ns: int, speed: FloatArray | None, readings: int) -> None:
         """Take the screws' speeds, the mean of so many readings."""
@@ -326,7 +260,7 @@ class RobustOdometry:
         waiting = self._angles.waiting()
         if waiting is not None:
             self._take_speed(*waiting, self._angles.readings)
-        if self._standstill is None or not self._standstill.holds:
+        if self._source == "fused" or not self._odometry.holds:
             self._predict(stamp_ns)
 
     def _predict(self, stamp_ns: int) -> None:

@@ -164,10 +164,8 @@ class Standstill:
         """Whether most rods have kept their directions for a window; None where too few say so."""
         frames = self._frames
         directions = np.full((3, self._whiskers), np.nan)
-        sine = np.sin(contacts.inclination)
-        directions[0, contacts.index] = sine * np.cos(contacts.azimuth)
-        directions[1, contacts.index] = sine * np.sin(contacts.azimuth)
-        directions[2, contacts.index] = np.cos(contacts.inclination)
+        rod = contacts.rod
+        directions[:, contacts.index] = rod / np.sqrt((rod**2).sum(axis=0))
         frames.append((stamp_ns, directions))
         while len(frames) > 1 and (stamp_ns - frames[1][0]) * 1e-9 >= WINDOW_S:
             frames.popleft()
