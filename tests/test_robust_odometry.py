@@ -24,6 +24,7 @@ from robominer_slam.estimation.planar_motion import (
 )
 from robominer_slam.estimation.robust_odometry import RobustOdometry
 from robominer_slam.estimation.screw_kinematics import forward_matrix
+from robominer_slam.estimation.slow_walk import SlowWalk
 from robominer_slam.estimation.turn_comparison import screw_turn, screw_turn_jacobian
 
 MATRIX = forward_matrix(0.078, math.radians(30.0), 0.15, 0.30)
@@ -269,3 +270,17 @@ def test_scan_matches_teach_the_biases_of_a_ready_made_odometry():
     np.testing.assert_allclose(odometry.bias[1:], bias[1:], atol=1e-3)
     assert odometry.bias[0] == pytest.approx(bias[0], abs=2e-3)
     assert abs(odometry.state_at(stamp).y) < 0.01
+
+
+@pytest.mark.parametrize("fused", [True, False])
+def test_slow_states_walk_alike_in_many_intervals_and_in_one(fused):
+    settings = RobustEstimationSection()
+    match = slice(17, 20) if fused else slice(12, 15)
+    often, once = (SlowWalk(settings, fused, match, [1e-6, 2e-6, 3e-6]) for _ in range(2))
+    due = [often.add(0.004, 0.01, 0.04) for _ in range(10)]
+    once.add(0.04, 0.1, 0.4)
+    assert due == [False] * 2 + [True] * 8
+    (q, kept), (q_once, kept_once) = often.take(), once.take()
+    np.testing.assert_allclose(q, q_once, rtol=1e-12)
+    assert kept == pytest.approx(kept_once, rel=1e-12)
+    assert often.take()[0] == [0.0] * match.stop, "what was told is not told again"
