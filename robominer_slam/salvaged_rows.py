@@ -13,6 +13,7 @@ from robominer_slam.packed_points import pack_points, unpack_points
 from robominer_slam.slam.keyframe import GraphEdge
 from robominer_slam.store_changes import edge_row
 from robominer_slam.store_pages import Row, Value
+from robominer_slam.store_versions import NUMBERS
 
 FloatArray = NDArray[np.float64]
 #: A keyframe's name: id of its map, its own.
@@ -64,6 +65,7 @@ class SalvagedRows:
         keyframes: key to rowid and row.
         edges: by rowid.
         sessions: id to row, without the id.
+        versions: id to row, of maps.
         without_touches: keyframes whose touches were damaged.
         bridges: edges that were added.
     """
@@ -73,6 +75,7 @@ class SalvagedRows:
         self.keyframes: dict[Key, tuple[int, Values]] = {}
         self.edges: dict[int, Values] = {}
         self.sessions: dict[int, Values] = {}
+        self.versions: dict[int, Values] = {}
         self.without_touches = 0
         self.bridges = 0
         self._named: set[Key] = set()
@@ -90,6 +93,9 @@ class SalvagedRows:
                 self.maps[row.rowid] = values[1], values[2], values[3]
             case (None, int(), int(), str(), str()) if 0 < row.rowid < LARGEST_ID:
                 self.sessions[row.rowid] = values[1:]
+            case (None, int(map_id), int(number), int(), int(), int(), int(), int() | float() as moved_m):
+                if row.rowid == map_id * NUMBERS + number and 0 < number < NUMBERS and 0.0 <= moved_m < FARTHEST_M:
+                    self.versions[row.rowid] = row.rowid, *values[1:]
             case (int(number), int(identity), int(), _, _, _):
                 if 0 < number < LARGEST_ID and 0 <= identity < LARGEST_ID:
                     self._take_keyframe((number, identity), row)
@@ -157,5 +163,7 @@ class SalvagedRows:
         many("INSERT INTO maps (id, name, created_unix_ns, robot) VALUES (?, ?, ?, ?)",
              [(number, *values) for number, values in sorted(self.maps.items())])  # fmt: skip
         many("INSERT INTO sessions VALUES (?, ?, ?, ?, ?)", [(n, *row) for n, row in sorted(self.sessions.items())])
+        many("INSERT INTO versions VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+             [row for _, row in sorted(self.versions.items()) if row[1] in self.maps])  # fmt: skip
         many("INSERT INTO keyframes VALUES (?, ?, ?, ?, ?, ?)", [row for _, (_, row) in sorted(self.keyframes.items())])
         many("INSERT INTO edges VALUES (?, ?, ?, ?, ?, ?, ?)", [row for _, row in sorted(self.edges.items())])

@@ -83,7 +83,7 @@ class MapStore:
         self._edges_seen = edge_keys(path, map_id) if map_id is not None else set()
         self._latest: BackendResult | None = None
         self._moved: BackendResult | None = None
-        self._corrections = Corrections()
+        self._corrections = Corrections(self._edges_seen)
         self._poses_time = time.monotonic()
         self._failed: list[Change] = []
         self._thread = threading.Thread(target=self._run, name="store", daemon=True)
@@ -168,9 +168,10 @@ class MapStore:
             raise StoreError(f"corrected poses cannot be stored now: {error}") from error
 
     def _update(self, poses: FloatArray, ids: Iterable[int], edges: Sequence[GraphEdge], tolerance: float) -> None:
-        with self._lock, transaction(self._opened()) as connection:
-            self._corrections.write(connection, self.map_id, poses, ids, edges, tolerance)
-        self._corrections.written()
+        with self._lock:
+            with transaction(self._opened()) as connection:
+                self._corrections.write(connection, self.map_id, poses, ids, edges, tolerance)
+            self._corrections.written()
 
     def rename(self, name: str) -> None:
         """Name the current map. Raises StoreError where the disk does not take it."""
@@ -253,9 +254,8 @@ class MapStore:
             return
         self._moved, self._poses_time = None, now
         try:
-            self._update(
-                result.poses, result.keyframe_ids, result.edges, SAVED_TOLERANCE if at_once else POSE_TOLERANCE
-            )
+            tolerance = SAVED_TOLERANCE if at_once else POSE_TOLERANCE
+            self._update(result.poses, result.keyframe_ids, result.edges, tolerance)
         except (StoreError, sqlite3.Error) as error:
             log.warning("corrected poses cannot be stored now: %s", error)
             self._moved = result
@@ -265,9 +265,11 @@ class MapStore:
             return
         before = [(change.row, change.row.id, change.row.logged) for change in batch]
         try:
-            with self._lock, transaction(self._opened()) as connection:
-                for change in batch:
-                    change.apply(connection)
+            with self._lock:
+                with transaction(self._opened()) as connection:
+                    for change in batch:
+                        change.apply(connection)
+                self._corrections.take(change for change in batch if change.row is self._row)
         except (StoreError, sqlite3.Error) as error:
             # The robot goes on mapping in memory; the batch is tried again with the next one.
             for row, identity, logged in before:
@@ -278,10 +280,8 @@ class MapStore:
             return
         if self.fault:
             log.warning("the map is stored again")
-        self._failed = []
-        self.fault = ""
+        self._failed, self.fault = [], ""
         self.written += sum(len(change.keyframes) for change in batch)
-        self._corrections.take(batch)
         self._keep_small()
 
     def _keep_small(self) -> None:

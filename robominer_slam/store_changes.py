@@ -130,6 +130,12 @@ def pack_pose(T: FloatArray) -> bytes:
     return np.asarray(geometry.to_vector7(T), dtype="<f8").tobytes()
 
 
+def unpack_pose(data: bytes) -> FloatArray:
+    """The pose in such bytes, shape (4, 4)."""
+    vector = np.frombuffer(data, dtype="<f8")
+    return geometry.pose_matrix(vector[:3], vector[3:])
+
+
 def edge_row(map_id: int, edge: GraphEdge) -> tuple[int, str, int, int, bytes, bytes, float]:
     """An edge as a row of `edges`."""
     information = edge.information[UPPER].astype("<f4").tobytes()

@@ -14,8 +14,8 @@ from pathlib import Path
 
 from robominer_slam.store_pages import PAGE_SIZE, merged
 
-#: 2: touches are sorted and thinned (`packed_points`), and there is a log of sessions.
-SCHEMA_VERSION = 2
+#: 2: touches are sorted and thinned (`packed_points`), and there is a log of sessions. 3: versions of maps.
+SCHEMA_VERSION = 3
 #: The log is taken into the database after so many pages: 2 MB.
 LOG_PAGES = 4000
 #: In the header of our databases, plus the schema version: where both differ, the header is damaged, not newer.
@@ -30,6 +30,12 @@ REFUSED_WRITES = (
 SESSIONS = (
     "CREATE TABLE sessions (id INTEGER PRIMARY KEY, map_id INTEGER, started_unix_ns INTEGER, program TEXT, found TEXT)"
 )
+VERSIONS = (
+    "CREATE TABLE versions (id INTEGER PRIMARY KEY, map_id INTEGER, number INTEGER, written_unix_ns INTEGER, "
+    "keyframes INTEGER, loop_closures INTEGER, moved INTEGER, moved_m REAL)"
+)
+#: Tables by the schema version that brought them.
+TABLES: dict[int, tuple[str, ...]] = {1: ("maps", "keyframes", "edges"), 2: ("sessions",), 3: ("versions",)}
 
 
 def _numbers(version: int) -> tuple[str, str]:
@@ -37,7 +43,7 @@ def _numbers(version: int) -> tuple[str, str]:
 
 
 #: What brings a database from a version to the next one.
-MIGRATIONS: dict[int, tuple[str, ...]] = {1: (SESSIONS, *_numbers(2))}
+MIGRATIONS: dict[int, tuple[str, ...]] = {1: (SESSIONS, *_numbers(2)), 2: (VERSIONS, *_numbers(3))}
 
 
 class StoreError(ValueError):
@@ -95,7 +101,7 @@ def make_tables(path: Path) -> None:
             foreign_keys=[("map_id", "maps", "id")],
         )
         database.execute("CREATE INDEX idx_edges_map_id_j ON edges (map_id, j)")
-        for statement in (SESSIONS, *_numbers(SCHEMA_VERSION)):
+        for statement in (SESSIONS, VERSIONS, *_numbers(SCHEMA_VERSION)):
             database.execute(statement)
     finally:
         database.close()

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robominer_slam import geometry
 from robominer_slam.configuration.file import ConfigurationError
 from robominer_slam.configuration.model import SlamSection
 from robominer_slam.packed_points import unpack_points
 from robominer_slam.slam.keyframe import GraphEdge, Keyframe
 from robominer_slam.slam.saved_map import SavedMap
-from robominer_slam.store_changes import UPPER
+from robominer_slam.store_changes import UPPER, unpack_pose
 from robominer_slam.store_database import StoreError, open_to_read
+from robominer_slam.store_versions import MapVersion, versions_in
 
 FloatArray = NDArray[np.float64]
 
@@ -86,11 +86,11 @@ def load_map(path: Path, wanted: str = "", clock_offset_ns: int = 0) -> tuple[in
 def _saved_map(
     keyframe_rows: Sequence[Sequence[Any]], edge_rows: Sequence[Any], name: str, clock_offset_ns: int
 ) -> SavedMap:
-    poses = np.array([_pose(row[3]) for row in keyframe_rows])
+    poses = np.array([unpack_pose(row[3]) for row in keyframe_rows])
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     travelled = np.concatenate([[0.0], np.cumsum(steps)])
     keyframes = tuple(
-        Keyframe(int(row[0]), int(row[1]) - clock_offset_ns, _pose(row[2]), unpack_points(row[4]), float(way))
+        Keyframe(int(row[0]), int(row[1]) - clock_offset_ns, unpack_pose(row[2]), unpack_points(row[4]), float(way))
         for row, way in zip(keyframe_rows, travelled, strict=True)
     )
     known = {k.id for k in keyframes}
@@ -123,6 +123,20 @@ def maps_in(path: Path) -> list[MapEntry]:
     finally:
         connection.close()
     return [MapEntry(int(number), str(name), int(created), int(count)) for number, name, created, count in rows]
+
+
+def map_versions(path: Path, wanted: str = "") -> tuple[int, str, list[MapVersion]]:
+    """Id and name of a map, and its versions, oldest first. Arguments and errors as of `load_map`."""
+    if not path.exists():
+        raise StoreError(f"{path}: is not there; expected a database with a saved map")
+    connection = _open(path)
+    try:
+        map_id, name = find_map(connection, wanted, str(path))
+        return map_id, name, versions_in(connection, map_id)
+    except sqlite3.Error as error:
+        raise StoreError(f"{path}: cannot be read: {error}") from error
+    finally:
+        connection.close()
 
 
 def map_to_start_in(
@@ -166,14 +180,11 @@ def _open(path: Path) -> sqlite3.Connection:
         raise StoreError(f"[store] path = {str(path)!r}: cannot be read: {error}; expected a database") from error
 
 
-def _pose(data: bytes) -> FloatArray:
-    vector = np.frombuffer(data, dtype="<f8")
-    return geometry.pose_matrix(vector[:3], vector[3:])
-
-
 def _edge(row: tuple[str, int, int, bytes, bytes, float]) -> GraphEdge:
     kind, i, j, T, upper, weight = row
     information = np.zeros((6, 6))
     information[UPPER] = np.frombuffer(upper, dtype="<f4")
     information = information + np.triu(information, 1).T
-    return GraphEdge("loop" if kind == "loop" else "odometry", int(i), int(j), _pose(T), information, float(weight))
+    return GraphEdge(
+        "loop" if kind == "loop" else "odometry", int(i), int(j), unpack_pose(T), information, float(weight)
+    )

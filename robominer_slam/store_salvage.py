@@ -19,6 +19,7 @@ from robominer_slam.salvaged_rows import SalvagedRows, keyframe_fault
 from robominer_slam.store_database import (
     APPLICATION_ID,
     SCHEMA_VERSION,
+    TABLES,
     StoreError,
     is_full,
     make_tables,
@@ -37,7 +38,6 @@ CHECK_STEPS = 10_000
 INDEX_FRAMES, INDEX_IS_MADE = 16, 12
 #: So much of a file tells whether it is text, bytes.
 TEXT_LOOKED_AT = 4096
-TABLES = {"maps", "keyframes", "edges"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,8 +156,10 @@ def _ask(connection: sqlite3.Connection, path: Path, commits: int) -> str:
     connection.set_progress_handler(lambda: time.monotonic() > end, CHECK_STEPS)
     try:
         tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-        if not tables >= TABLES:
-            return f"tables are missing: {', '.join(sorted(TABLES - tables))}"
+        version = connection.execute("PRAGMA user_version").fetchone()[0]
+        missing = {name for since, names in TABLES.items() if since <= version for name in names} - tables
+        if missing:
+            return f"tables are missing: {', '.join(sorted(missing))}"
         used = _frames_in_use(connection, path)
         if used is not None and used < commits:
             return f"{commits - used} of {commits} pages of the write-ahead log cannot be used"

@@ -174,14 +174,15 @@ def test_a_database_of_version_1_is_brought_up_to_date_and_its_touches_are_read(
     connection = sqlite3.connect(path)
     connection.execute("UPDATE keyframes SET points = ?", (zlib.compress(old.tobytes()),))
     connection.execute("DROP TABLE sessions")
+    connection.execute("DROP TABLE versions")
     connection.execute("PRAGMA user_version = 1")
     connection.execute("PRAGMA application_id = 0")
     connection.commit()
     connection.close()
     assert check_and_salvage(path).reason == ""
     open_database(path).close()
-    assert rows(path, "PRAGMA user_version") == [(2,)]
-    assert rows(path, "SELECT * FROM sessions") == []
+    assert rows(path, "PRAGMA user_version") == [(3,)]
+    assert rows(path, "SELECT * FROM sessions") == rows(path, "SELECT * FROM versions") == []
     np.testing.assert_allclose(load_map(path)[1].keyframes[0].points, old / 1000)
 
 

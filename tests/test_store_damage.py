@@ -52,9 +52,12 @@ def test_an_undamaged_database_is_left_alone(original: Path, tmp_path: Path):
 
 def test_what_is_salvaged_equals_what_was_stored_and_hangs_together(original: Path, tmp_path: Path):
     _, whole = load_map(original)
-    path = damage(original, tmp_path / "a", "blocks of noise", 5)
-    salvage = check_and_salvage(path)
-    assert salvage.bridges > 0, "the seed is to be one that tears the graph"
+    for seed in range(20):
+        path = damage(original, tmp_path / str(seed), "blocks of noise", seed)
+        salvage = check_and_salvage(path)
+        if salvage.bridges:
+            break
+    assert salvage.bridges > 0, "one of the seeds is to tear the graph"
     _, left = load_map(path)
     places = {k: n for n, k in enumerate(whole.ids)}
     for k, pose in zip(left.keyframes, left.poses, strict=True):

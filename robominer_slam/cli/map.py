@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import click
@@ -10,13 +11,14 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from robominer_slam.configuration.model import StoreSection
 from robominer_slam.map_files.comparison import difference
 from robominer_slam.map_files.formats import FORMATS, ExportSettings, cloud
 from robominer_slam.map_files.octomap import OctomapSizeError
 from robominer_slam.mapping.height_grid import GridSizeError
 from robominer_slam.replay_session import split_name
 from robominer_slam.slam.saved_map import SavedMap
-from robominer_slam.store_reader import load_map, maps_in
+from robominer_slam.store_reader import load_map, map_versions, maps_in
 
 MAP = "DATABASE[:NAME]"
 #: What `map info` tells of each map, and how a person reads it.
@@ -30,6 +32,16 @@ COLUMNS = {
     "distance_m": "driven (m)",
     "extent_m": "extent (m)",
 }
+#: The same of `map versions`.
+VERSION_COLUMNS = {
+    "number": "version",
+    "written": "written (UTC)",
+    "keyframes": "keyframes",
+    "loop_closures": "loops",
+    "moved": "moved",
+    "moved_m_max": "by at most (m)",
+}
+HERE = StoreSection().path
 
 
 @click.group("map", epilog="Example: robominer-slam map export map.db heights.tif --cell 0.02")
@@ -48,12 +60,34 @@ def info(database: Path, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps({"database": str(database), "bytes": database.stat().st_size, "maps": entries}))
         return
-    table = Table(title=f"{database}: {database.stat().st_size / 1e6:.1f} MB")
-    for heading in COLUMNS.values():
-        table.add_column(heading, justify="left" if heading in ("name", "created (UTC)") else "right")
-    for entry in entries:
-        table.add_row(*(_text(entry[key]) for key in COLUMNS))
-    Console().print(table)
+    _print(f"{database}: {database.stat().st_size / 1e6:.1f} MB", COLUMNS, entries)
+
+
+@map_group.command(epilog=f"Example: robominer-slam map versions map.db:monday\n\nWithout DATABASE: {HERE}")
+@click.argument("saved", metavar=f"[{MAP}]", default=HERE)
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def versions(saved: str, as_json: bool) -> None:
+    """When stored poses of a map were corrected, how many, and how far.
+
+    Without NAME of the newest map.
+    """
+    database, wanted = split_name(saved)
+    number, name, known = map_versions(database, wanted)
+    entries = [
+        {
+            "number": one.number,
+            "written": _utc(one.written_unix_ns),
+            "keyframes": one.keyframes,
+            "loop_closures": one.loop_closures,
+            "moved": one.moved,
+            "moved_m_max": round(one.moved_m, 6),
+        }
+        for one in known
+    ]
+    if as_json:
+        click.echo(json.dumps({"database": str(database), "id": number, "name": name, "versions": entries}))
+        return
+    _print(f"{database}: versions of map {number} {name}".rstrip(), VERSION_COLUMNS, entries)
 
 
 ENDINGS = "\n\n".join(f"{ending}: {what}." for ending, (what, _) in FORMATS.items())
@@ -128,13 +162,26 @@ def _described(number: int, created_ns: int, saved: SavedMap) -> dict[str, objec
     return {
         "id": number,
         "name": "" if saved.name == str(number) else saved.name,
-        "created": str(np.datetime64(created_ns, "ns").astype("datetime64[s]")),
+        "created": _utc(created_ns),
         "keyframes": len(saved.keyframes),
         "loop_closures": sum(edge.kind == "loop" for edge in saved.edges),
         "points": len(points),
         "distance_m": round(saved.keyframes[-1].travelled, 2) if saved.keyframes else 0.0,
         "extent_m": extent,
     }
+
+
+def _utc(unix_ns: int) -> str:
+    return str(np.datetime64(unix_ns, "ns").astype("datetime64[s]"))
+
+
+def _print(title: str, columns: Mapping[str, str], entries: Sequence[Mapping[str, object]]) -> None:
+    table = Table(title=title)
+    for heading in columns.values():
+        table.add_column(heading, justify="left" if heading == "name" or "UTC" in heading else "right")
+    for entry in entries:
+        table.add_row(*(_text(entry[key]) for key in columns))
+    Console().print(table)
 
 
 def _text(value: object) -> str:
