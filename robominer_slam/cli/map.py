@@ -67,7 +67,7 @@ def info(database: Path, as_json: bool) -> None:
 @click.argument("saved", metavar=f"[{MAP}]", default=HERE)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def versions(saved: str, as_json: bool) -> None:
-    """When stored poses of a map were corrected, how many, and how far.
+    """When stored poses were corrected, how many, how far.
 
     Without NAME of the newest map.
     """
