@@ -98,7 +98,9 @@ class Drive:
     def __init__(self, rng: np.random.Generator, settings: RobustEstimationSection, conditions: Conditions) -> None:
         self.rng, self.settings, self._conditions = rng, settings, conditions
         self._whiskers = DrawnDirections(rng) if conditions.whiskers else None
-        self.odometry = RobustOdometry(RobustEstimationSection(), conditions.source, self._whiskers, MATRIX)
+        # The drawn directions are no rods that could rest.
+        own = RobustEstimationSection(standstill=False)
+        self.odometry = RobustOdometry(own, conditions.source, self._whiskers, MATRIX)
         self._pose = np.zeros(3)
         self.nees: list[float] = []
         # The filter's time begins here.
