@@ -9,7 +9,6 @@ import selectors
 import threading
 import time
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
 import serial
@@ -19,8 +18,9 @@ from drivers.measurement import Measurement
 from drivers.open_port import FIRST_RETRY_S, OpenPort, node
 from drivers.port_discovery import byte_time_ns, canonical, check_port_name, find_paths
 from drivers.port_probe import may_speak, verdict
+from drivers.port_resets import PortResets
 from drivers.settings import DeviceSettings
-from drivers.usb_recovery import FIRST_RESET_NS, LONGEST_RESET_NS, UsbResetError, reset, usb_port
+from drivers.usb_recovery import FIRST_RESET_NS
 
 log = logging.getLogger(__name__)
 
@@ -34,8 +34,6 @@ READ_BYTES = 65536
 #: A port that did not have the device is not tried again so soon; a silent one may still be starting.
 WRONG_AGAIN_S = 10.0
 SILENT_AGAIN_S = 1.0
-#: So many failures in a row without a measurement between them call for a reset as well.
-FAILURES_BEFORE_RESET = 5
 NOT_FOUND = "port {}: not found on the ports that are there"
 
 
@@ -66,8 +64,7 @@ class SerialReader:
         #: When there is something to do next that no data call for.
         self._tend_ns = 0
         self._failure: BaseException | None = None
-        self._usb_backend = usb_backend
-        self._resets: ThreadPoolExecutor | None = None
+        self._resets = PortResets(self._close, usb_backend)
         self.dropped = 0
 
     def __enter__(self) -> SerialReader:
@@ -80,8 +77,7 @@ class SerialReader:
         for entry in self._ports:
             self._close(entry)
         self._selector.close()
-        if self._resets is not None:
-            self._resets.shutdown(wait=False, cancel_futures=True)
+        self._resets.close()
 
     def get(self, timeout: float) -> tuple[str, Measurement] | None:
         """The next (device, measurement), or None after `timeout` seconds.
@@ -126,14 +122,14 @@ class SerialReader:
     def _tend(self, entry: OpenPort, now_ns: int) -> None:
         """What a port needs from time to time, whether data come or not."""
         if entry.reset is not None:
-            self._after_reset(entry)
+            self._resets.end_if_done(entry)
         elif entry.port is None and time.monotonic() >= entry.retry_at:
             self._open(entry)
         if entry.device.state == "probing":
             self._probe(entry, now_ns)
         self._write(entry)
         entry.device.check_silence(now_ns)
-        self._reset_if_wedged(entry, now_ns)
+        self._resets.begin_if_wedged(entry, now_ns)
         self._log_change(entry)
 
     def _next_tend_ns(self, now_ns: int) -> int:
@@ -197,37 +193,6 @@ class SerialReader:
             device.fault = NOT_FOUND.format(device.settings.port)
             entry.retry_at = time.monotonic()
 
-    def _reset_if_wedged(self, entry: OpenPort, now_ns: int) -> None:
-        """Reset a USB device that is open but has sent nothing for long, or that fails again and again."""
-        silent = entry.port is not None and entry.device.state == "silent"
-        silent = silent and now_ns - max(entry.bytes_ns, entry.opened_ns) > entry.reset_after_ns
-        if entry.reset is not None or not (silent or entry.failures >= FAILURES_BEFORE_RESET):
-            return
-        entry.failures = 0
-        if entry.device.path is not None:
-            entry.usb = usb_port(entry.device.path) or entry.usb
-        entry.bytes_ns = now_ns
-        if entry.usb is None:
-            return
-        entry.reset_after_ns = min(2 * entry.reset_after_ns, LONGEST_RESET_NS)
-        self._close(entry)
-        entry.device.state, entry.device.path = "resetting", None
-        entry.device.counters["resets"] += 1
-        if self._resets is None:
-            # A reset takes up to a second, in which the other devices must be read.
-            self._resets = ThreadPoolExecutor(1, thread_name_prefix="usb-reset")
-        entry.reset = self._resets.submit(reset, *entry.usb, backend=self._usb_backend)
-
-    def _after_reset(self, entry: OpenPort) -> None:
-        if entry.reset is None or not entry.reset.done():
-            return
-        error, entry.reset = entry.reset.exception(), None
-        if error is not None and not isinstance(error, UsbResetError):
-            raise error
-        entry.device.state = "absent"
-        entry.device.fault = "silent, has been reset" if error is None else f"silent, and cannot be reset: {error}"
-        entry.retry_at = time.monotonic()
-
     def _read(self, entry: OpenPort) -> None:
         port = entry.port
         if port is None:
@@ -286,10 +251,7 @@ class SerialReader:
         self._queue.put((device, measurement))
 
     def _lost(self, entry: OpenPort, fault: str) -> None:
-        path = entry.device.path
-        entry.failures += 1
-        if entry.failures >= FAILURES_BEFORE_RESET and path is not None:
-            entry.usb = usb_port(path) or entry.usb
+        self._resets.failed(entry)
         self._close(entry)
         entry.device.lost(fault)
         entry.retry_at = time.monotonic() + FIRST_RETRY_S

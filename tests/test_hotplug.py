@@ -15,7 +15,7 @@ import pytest
 import usb.backend
 import usb.core
 
-from drivers import serial_reader
+from drivers import port_resets, serial_reader
 from drivers.measurement import HallFrame, ImuSample
 from drivers.port_discovery import find_paths
 from drivers.serial_reader import SerialReader
@@ -207,7 +207,7 @@ def test_a_reset_that_cannot_work_says_why():
 
 @pytest.mark.parametrize("refuses", [False, True])
 def test_a_wedged_device_is_reset_with_longer_and_longer_waits_while_others_go_on(tmp_path, monkeypatch, refuses):
-    monkeypatch.setattr(serial_reader, "usb_port", lambda path: (0x2341, 0x43, None) if "imu" in path else None)
+    monkeypatch.setattr(port_resets, "usb_port", lambda path: (0x2341, 0x43, None) if "imu" in path else None)
     monkeypatch.setattr(serial_reader, "FIRST_RESET_NS", 200_000_000)
     monkeypatch.setattr("drivers.open_port.FIRST_RESET_NS", 200_000_000)
     bus = FakeUsb(Descriptor(0x2341, 0x43, 1), refuses=refuses)
