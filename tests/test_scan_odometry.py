@@ -12,7 +12,7 @@ from robominer_slam import geometry
 from robominer_slam.configuration.robust_estimation_section import RobustEstimationSection
 from robominer_slam.configuration.robust_slam_section import ScanMatchingSection
 from robominer_slam.estimation.robust_odometry import RobustOdometry
-from robominer_slam.slam.scan_odometry import ScanOdometry
+from robominer_slam.slam.scan_odometry import ScanOdometry, varying
 from tests.touched_ground import MODEL, flat, rough, touches
 
 BIAS = np.array([0.003, 0.006, 0.004])
@@ -111,6 +111,31 @@ def test_a_flat_map_gives_matches_next_to_no_information():
             correction = scans_on(height, np.random.default_rng(seed)).match(pose, np.eye(4) * 1e-4, points)
             told.append(np.linalg.eigvalsh(correction.information)[-1])
     assert np.mean(told[:10]) < 0.001 * np.mean(told[10:])
+
+
+@pytest.mark.parametrize("turned", np.radians([0.0, 50.0, 200.0]))
+def test_heading_does_not_tell_the_way_along_a_corridor(turned):
+    """Most of the slopes along it are errors, and so are their products with those that tell the heading."""
+    known = np.array([[100.0, 0.0, 60.0], [0.0, 5e4, 0.0], [60.0, 0.0, 500.0]])
+    errors = np.diag([900.0, 1e3, 20.0])
+    c, s = np.cos(turned), np.sin(turned)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    along, across = R[:, 0], R[:, 1]
+    known = R @ known @ R.T
+    varies = varying(known, known + R @ errors @ R.T)
+    told = varies @ known @ varies
+    assert along @ told @ along == pytest.approx(0.0, abs=1e-6)
+    np.testing.assert_allclose(told @ along, 0.0, atol=1e-6)
+    assert across @ told @ across == pytest.approx(5e4)
+    assert told[2, 2] == pytest.approx(500.0)
+
+
+def test_ground_that_varies_everywhere_keeps_what_it_tells():
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(3, 3))
+    known = root @ root.T + np.eye(3)
+    np.testing.assert_allclose(varying(known, 1.5 * known), np.eye(3))
+    np.testing.assert_allclose(varying(known, 10.0 * known), 0.0, atol=1e-12)
 
 
 def test_few_contacts_other_ground_and_standing_still_give_no_match():

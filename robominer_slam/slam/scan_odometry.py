@@ -29,6 +29,9 @@ LEAST_CONTACTS = 8
 TURN_ARM = 0.15
 #: Of the best known direction's information: a direction with less has none.
 LEAST_SHARE = 1e-9
+#: Of the apparent information along a direction, less than this is no more than errors of the slopes.
+LEAST_VARIATION = 0.25
+EYE = np.eye(3)
 #: So many matches in a row in which less than this share fits, each over ground known to the other share, are a
 #: break: on the thesis's ground the best of five never had less than 0.74, after being carried 0.3 to 0.66.
 BREAK_MISFITS = 5
@@ -112,12 +115,14 @@ class ScanOdometry:
         # The touches' noise pulls at d as much as H says, whatever of H the slopes' errors have made up: with
         # H0 d = -g, the information of d is H0 H^-1 H0.
         known, apparent = height_left_free(found.information), height_left_free(found.curvature)
+        varies = varying(known, apparent)
+        known = varies.dot(known).dot(varies)
         information = known.dot(np.linalg.solve(apparent + 1e-9 * np.eye(3), known)) * self._parameters.share
         # The least-squares offset of the touches alone: H d = -g at the predicted pose.
         H = found.curvature
         gradient = found.gradient - H.dot(offset)
         reduced = gradient[:3] - H[:3, Z] * gradient[Z] / max(H[Z, Z], 1e-12)
-        return ScanCorrection(_least(known, -reduced), information)
+        return ScanCorrection(_least(known, -varies.dot(reduced)), information)
 
     def add(self, pose: FloatArray, points: FloatArray) -> None:
         """Put a frame's contacts (in base_link, levelled) into the map at its corrected pose (x, y, yaw, z)."""
@@ -164,3 +169,26 @@ def _least(information: FloatArray, right_side: FloatArray) -> FloatArray:
     along = vectors.T.dot(right_side)
     solution: FloatArray = vectors.dot(np.divide(along, values, out=np.zeros(len(values)), where=known))
     return solution
+
+
+def varying(known: FloatArray, apparent: FloatArray) -> FloatArray:
+    """Projector, shape (3, 3), that takes out directions, and heading, in which the ground seems the same.
+
+    Where slopes along a direction are mostly errors, so are their products with the others: the free direction of a
+    corridor's H is turned a little out of the corridor's, has some heading in it, and would tell the place along the
+    corridor by the heading.
+
+    Args:
+        known: information about (x, y, yaw), shape (3, 3).
+        apparent: the same with what errors of the slopes add to it.
+    """
+    values, vectors = np.linalg.eigh(known[:2, :2])
+    of_errors = ((vectors * apparent[:2, :2].dot(vectors)).sum(axis=0) * LEAST_VARIATION).tolist()
+    projector = EYE.copy()
+    for k, value in enumerate(values.tolist()):
+        if value < of_errors[k]:
+            along = vectors[:, k]
+            projector[:2, :2] -= along[:, None] * along
+    if known[YAW, YAW] < LEAST_VARIATION * apparent[YAW, YAW]:
+        projector[YAW, YAW] = 0.0
+    return projector
