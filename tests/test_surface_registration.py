@@ -156,3 +156,16 @@ def test_several_guesses_at_once_end_where_each_would_alone():
         assert (found.overlap, found.inliers, found.cost) == pytest.approx((alone.overlap, alone.inliers, alone.cost))
     assert together[1].overlap == 0.0, "one is lost, and takes no other with it"
     assert np.isinf(together[1].cost)
+
+
+def test_guesses_on_the_way_to_one_place_are_followed_as_one():
+    points = touches(rough(3), np.random.default_rng(7), 300, HALF, noise=4e-4)
+    surface = ground(rough(3), 3, noise=4e-4)
+    guesses = np.array([[0.01, 0.0, 0.02, 0.0], [0.1, 0.12, 0.4, 0.0], [-0.02, 0.02, -0.03, 0.002]])
+    each = fit_each(surface, points, guesses, NO_PRIOR, 3)
+    found = fit_each(surface, points, guesses, NO_PRIOR, 3, (0.03, 0.05))
+    assert len(found) == 2
+    best = min(found, key=lambda match: match.cost)
+    assert best.cost == pytest.approx(min(match.cost for match in each), rel=0.01)
+    np.testing.assert_allclose(best.pose, np.zeros(4), atol=0.01)
+    assert any(np.allclose(match.pose, each[1].pose) for match in found), "another place is not affected"

@@ -36,6 +36,8 @@ HEIGHT_SIGMA = 0.01
 ASSOCIATIONS = 3
 #: Places of a search that are refined and compared.
 ALTERNATIVES = 3
+#: Places that come within half of what makes two of them one, m and rad, are refined as one: most do.
+APART = 0.5 * SAME_DISTANCE, 0.5 * SAME_ANGLE
 #: A refined place may lie so far outside of the search's window, m and rad.
 BEYOND = np.array([0.05, 0.05, 0.1])
 
@@ -184,7 +186,7 @@ class ClosureSearch:
         height_prior = np.zeros((4, 4))
         height_prior[Z, Z] = 1.0 / HEIGHT_SIGMA**2
         guesses = np.column_stack([places, np.zeros(len(places))])
-        matches = fit_each(surface, points, guesses, height_prior, ASSOCIATIONS)
+        matches = fit_each(surface, points, guesses, height_prior, ASSOCIATIONS, APART)
         enough = [m for m in matches if m.overlap >= self._parameters.min_overlap] or matches
         best = min(enough, key=lambda m: m.cost)
         others = [m.cost for m in enough if not _same(m.pose, best.pose)]

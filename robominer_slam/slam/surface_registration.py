@@ -129,10 +129,16 @@ def fit_each(
     guesses: FloatArray,
     prior_information: FloatArray,
     associations: int = 2,
+    apart: tuple[float, float] | None = None,
 ) -> list[SurfaceMatch]:
     """As `fit`, from each of several guesses, shape (k, 4): together they cost less than one after the other.
 
     Touches where the surface is not known weigh nothing.
+
+    Args:
+        surface, points, guesses, prior_information, associations: as of `fit`.
+        apart: guesses that come as near to one of less cost, m and rad, are on the way to the same place: they are
+            not followed, and have no match, unless one of all gets lost. None follows all of them.
     """
     poses = guesses.copy()
     regular = prior_information + np.eye(4) * 1e-9
@@ -163,6 +169,11 @@ def fit_each(
             e = r + (step[:, None] @ J)[:, 0]
         gradient = (JtW @ e[:, :, None])[:, :, 0]
         poses = poses + step
+        if apart is not None and len(poses) > 1 and again < associations - 1:
+            squared, limit = np.square(e), INLIER_SIGMAS**2 * patches.variance.reshape(known.shape)
+            costs = (np.minimum(squared, limit) * known).sum(axis=1) / known.sum(axis=1)
+            followed = _distinct(poses, costs, *apart)
+            poses, guesses, pull = poses[followed], guesses[followed], pull[followed]
     slope_noise = patches.slope_noise + turned_slope_noise(patches.slope)
     noise = slope_noise_information(q, poses, slope_noise.reshape(3, *known.shape), weight)
     information = _less(H, noise)
@@ -190,6 +201,17 @@ def _without_lost(
         SurfaceMatch(pose, *nothing, float(on.mean()), 0.0, 0.0, np.inf, np.zeros((0, 3))) if gone else next(left)
         for pose, on, gone in zip(poses, known, lost, strict=True)
     ]
+
+
+def _distinct(poses: FloatArray, costs: FloatArray, distance: float, angle: float) -> list[int]:
+    """Rows of the poses (k, 4), growing, that are not within a distance, m, and an angle, rad, of one of less cost."""
+    kept: list[int] = []
+    for row in np.argsort(costs, kind="stable").tolist():
+        off = poses[kept] - poses[row]
+        near = (np.hypot(off[:, X], off[:, Y]) <= distance) & (np.abs(wrap_angle(off[:, YAW])) <= angle)
+        if not near.any():
+            kept.append(row)
+    return sorted(kept)
 
 
 def height_left_free(H: FloatArray) -> FloatArray:
