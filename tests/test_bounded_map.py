@@ -141,11 +141,25 @@ def test_closures_that_covariances_do_not_know_yet_leave_them_too_large():
     tracked = TrackedCovariance(graph, refresh=1000)
     before = tracked.of_newest()
     graph.edges.append(loop(graph, 86, 149, 0.0))
-    tracked.closed(1, sigma=1.0)
+    tracked.closed(1, np.zeros((3, 3)), sigma=0.025)
     assert np.linalg.eigvalsh(tracked.of_newest() - graph.covariance([149]))[0] >= -1e-12
     np.testing.assert_array_equal(tracked.of_newest(), before)
-    tracked.forget()
-    np.testing.assert_allclose(tracked.of_newest(), graph.covariance([149]))
+    tracked.closed(1, np.diag([0.03**2, 0.0, 0.0]), sigma=0.025)
+    np.testing.assert_allclose(tracked.of_newest(), graph.covariance([149]), err_msg="they told much: they count")
+
+
+def test_covariances_are_made_anew_one_keyframe_after_others_went():
+    graph = circling(150)
+    tracked = TrackedCovariance(graph, refresh=1000)
+    before = tracked.of_newest()
+    remove_keyframes(graph, graph.nodes.ids[20:60:4].tolist())
+    tracked.shrunk()
+    np.testing.assert_array_equal(tracked.of_newest(), before)
+    edge = odometry(np.random.default_rng(9), 149, 150)
+    graph.edges.append(edge)
+    graph.nodes.append(150, geometry.se2_compose(graph.nodes[149], parts_at(edge, graph.bias)), 0.0, np.eye(3), 37.5)
+    tracked.follow(edge, graph.bias)
+    np.testing.assert_allclose(tracked.of_newest(), graph.covariance([150]))
 
 
 def test_merging_takes_the_farthest_first_and_never_beyond_the_extent():

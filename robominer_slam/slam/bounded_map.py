@@ -35,6 +35,8 @@ FloatArray = NDArray[np.float64]
 
 #: Keyframes that leave at once where too many are there: what each costs is shared by these.
 BATCH = 16
+#: They may leave when room is left for this part of them, if the keyframe takes little time otherwise.
+EARLY = 2
 #: Keyframes whose touches are judged at one keyframe at most: those of a small map wait until it is large.
 DECISIONS = 2
 #: Where closures are more than keyframes may be, this part of them goes, too: leverages are computed seldom.
@@ -133,12 +135,17 @@ class BoundedMap:
             self._judged.pop(key)
             self.bare.append(key)
 
-    def shrink(self) -> bool:
-        """Let keyframes go where they are too many; True if any went."""
+    def shrink(self, busy: bool) -> bool:
+        """Let keyframes go where they are too many, or are about to be and there is time for it; True if any went.
+
+        Args:
+            busy: whether this keyframe has taken much time already: it waits for another while there is room.
+        """
         bounds, graph = self._bounds, self._graph
-        if len(graph.nodes) <= bounds.max_keyframes:
+        room = min(BATCH, bounds.max_keyframes // 10)
+        if len(graph.nodes) <= bounds.max_keyframes - (0 if busy else room // EARLY):
             return False
-        target = bounds.max_keyframes - min(BATCH, bounds.max_keyframes // 10)
+        target = bounds.max_keyframes - room
         window = min(bounds.local_window, bounds.max_keyframes // 2)
         robot = graph.nodes.poses[-1, :2].copy()
         self._remove(interior_of_covered(graph, window, bounds.tie_spacing)[: len(graph.nodes) - target])
@@ -154,6 +161,7 @@ class BoundedMap:
         excess = int(graph.edges.loop.sum()) - bounds.max_keyframes
         if excess > 0:
             drop_least_needed(graph, excess + bounds.max_keyframes // CLOSURE_BATCH, window)
+        graph.update_chi2()
         return True
 
     def _closed(self, key: int) -> bool:

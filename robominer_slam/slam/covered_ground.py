@@ -18,10 +18,11 @@ def covered_share(points: FloatArray, ground: FloatArray, cell: float) -> float:
     own = np.floor(points[:, :2] / cell).astype(np.int64)
     low = own.min(axis=0) - 1
     shape = own.max(axis=0) + 2 - low
-    there = np.floor(ground[:, :2] / cell).astype(np.int64) - low
-    there = there[((there >= 0) & (there < shape)).all(axis=1)]
+    # Axis by axis: rows of two are slow.
+    x, y = np.floor(ground[:, 0] / cell) - low[0], np.floor(ground[:, 1] / cell) - low[1]
+    there = (x >= 0) & (x < shape[0]) & (y >= 0) & (y < shape[1])
     known = np.zeros(shape, dtype=np.bool_)
-    known[there[:, 0], there[:, 1]] = True
+    known[x[there].astype(np.intp), y[there].astype(np.intp)] = True
     near = known.copy()
     near[1:] |= known[:-1]
     near[:-1] |= known[1:]

@@ -107,6 +107,7 @@ class TrackedCovariance:
         self._ids = np.zeros(0, dtype=np.int64)
         self._tail = 0
         self._closures = 0
+        self._shrunk = False
         self._P = np.zeros((0, 0))
         self._way = np.zeros((0, 0))
         self._joined = np.zeros((0, 0))
@@ -115,11 +116,26 @@ class TrackedCovariance:
         """Factorise anew when next asked: the graph says less than it did, or much more."""
         self._base = None
 
-    def closed(self, closures: int, sigma: float) -> None:
-        """Closures were added to the graph; where it was less sure than `sigma`, m, they count at once."""
+    @property
+    def is_outdated(self) -> bool:
+        """Whether the next covariance asked for takes a factorisation."""
+        return self._base is None
+
+    def shrunk(self) -> None:
+        """Keyframes have left the graph, and moved none of the others: it is factorised anew at the next keyframe."""
+        self._shrunk = True
+
+    def closed(self, closures: int, relative: FloatArray, sigma: float) -> None:
+        """Closures were added to the graph; where they tell much, they count at once.
+
+        Args:
+            closures: how many.
+            relative: covariance that the newest keyframe had in their anchors, the greatest, shape (3, 3).
+            sigma: if it was less sure than this in x or y, m, they tell much.
+        """
         self._closures += closures
         self._outdate()
-        if self._base is not None and float(np.linalg.eigvalsh(self._P[:2, :2])[-1]) > sigma**2:
+        if self._base is not None and float(np.linalg.eigvalsh(relative[:2, :2])[-1]) > sigma**2:
             self.forget()
 
     def follow(self, edge: LevelEdge, bias: FloatArray, walk: FloatArray | None = None) -> None:
@@ -134,6 +150,8 @@ class TrackedCovariance:
             return
         self._tail += 1
         self._outdate()
+        if self._shrunk:
+            self.forget()
         nb = bias.size
         step = geometry.se2_compose(edge.Z, geometry.se2_exp(edge.jacobian @ (bias - edge.reference)))
         F = np.eye(3 + nb)
@@ -181,6 +199,7 @@ class TrackedCovariance:
             base = graph.marginals()
             self._ids = graph.nodes.ids.copy()
             self._tail = self._closures = 0
+            self._shrunk = False
             last = len(self._ids) - 1
             self._way = np.eye(3 + graph.bias.size)
             self._P = base.joint_with_bias([last])

@@ -25,6 +25,7 @@ def remove_keyframes(graph: KeyframeGraph, keys: list[int]) -> list[LevelEdge]:
     """Take keyframes, neither the first nor the last, out of a graph.
 
     A closure that now stands for what was known already by closures of the same two keyframes takes their place.
+    Squared errors of edges are not valid until `KeyframeGraph.update_chi2`: several calls can share it.
 
     Returns:
         The edges that say what was known of the others (`factor_recovery`).
@@ -40,7 +41,6 @@ def remove_keyframes(graph: KeyframeGraph, keys: list[int]) -> list[LevelEdge]:
             edges.keep(~same)
         edges.append(edge)
     graph.nodes.remove(keys)
-    graph.update_chi2()
     return found
 
 

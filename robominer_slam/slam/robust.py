@@ -78,6 +78,7 @@ class RobustBackend:
         self._recent: list[Closure] = []
         self._last: Keyframe | None = None
         self._covariance = np.zeros((3, 3))
+        self._predicted = np.zeros((3, 3))
         self._version = 0
         self.closures = ClosureCounters()
 
@@ -91,7 +92,7 @@ class RobustBackend:
             self._add_loop(closure)
         if accepted:
             self._optimise(accepted)
-        self._bound(keyframe.id)
+        self._bound(keyframe.id, searched or self._tracked.is_outdated)
         if self._last is not None:
             self._covariance = self._tracked.of_newest()
         self._last = keyframe
@@ -193,10 +194,12 @@ class RobustBackend:
         sigma = float(np.sqrt(np.linalg.eigvalsh(self._predicted_covariance()[:2, :2])[-1]))
         reach = self._parameters.closure.sigmas * sigma
         found = []
+        self._predicted = np.zeros((3, 3))
         for ids in self._chosen(k, self._search.passes(k, self._outlines(reach), nodes, reach)):
             off = nodes.poses[nodes.rows(ids), :2] - nodes.poses[-1, :2]
             anchor = ids[int(np.argmin(np.hypot(off[:, 0], off[:, 1])))]
             covariance = self._tracked.relative(anchor)
+            self._predicted = max(self._predicted, covariance, key=lambda P: float(np.trace(P[:2, :2])))
             closure = self._search.find(
                 source,
                 k,
@@ -287,7 +290,7 @@ class RobustBackend:
             edges = graph.edges
             contradicted = edges.loop & edges.enabled & (edges.chi2 > self._limit())
             if not contradicted.any():
-                self._tracked.closed(len(accepted), self._parameters.closure.max_sigma)
+                self._tracked.closed(len(accepted), self._predicted, self._parameters.closure.max_sigma)
                 return
         self._since_full = 0
         self._optimise_whole()
@@ -333,15 +336,15 @@ class RobustBackend:
 
     # ------------------------------------------------------------------------------------------------ bounds
 
-    def _bound(self, newest: int) -> None:
+    def _bound(self, newest: int, busy: bool) -> None:
         """Let go of touches and keyframes that are too many."""
         p = self._parameters.closure
         self._map.settle(newest, p.patch, p.partner_span, p.min_travel)
-        if self._map.shrink():
+        if self._map.shrink(busy):
             nodes = self._graph.nodes
             self._pending = [c for c in self._pending if c.i in nodes and c.j in nodes]
             self._recent = [c for c in self._recent if c.i in nodes and c.j in nodes]
-            self._tracked.forget()
+            self._tracked.shrunk()
 
     def release(self) -> None:
         """Let go of what must be freed in the thread that made it."""
