@@ -35,8 +35,8 @@ FloatArray = NDArray[np.float64]
 
 #: Keyframes that leave at once where too many are there: what each costs is shared by these.
 BATCH = 16
-#: They may leave when room is left for this part of them, if the keyframe takes little time otherwise.
-EARLY = 2
+#: They may leave when half of that room is left yet, if the keyframe does none of so many things that take time.
+LOADS = 2
 #: Keyframes whose touches are judged at one keyframe at most: those of a small map wait until it is large.
 DECISIONS = 2
 #: Where closures are more than keyframes may be, this part of them goes, too: leverages are computed seldom.
@@ -135,15 +135,16 @@ class BoundedMap:
             self._judged.pop(key)
             self.bare.append(key)
 
-    def shrink(self, busy: bool) -> bool:
+    def shrink(self, load: int) -> bool:
         """Let keyframes go where they are too many, or are about to be and there is time for it; True if any went.
 
         Args:
-            busy: whether this keyframe has taken much time already: it waits for another while there is room.
+            load: how many things that take much time this keyframe has done already, up to `LOADS`: the more, the
+                longer it waits for another while there is room.
         """
         bounds, graph = self._bounds, self._graph
         room = min(BATCH, bounds.max_keyframes // 10)
-        if len(graph.nodes) <= bounds.max_keyframes - (0 if busy else room // EARLY):
+        if len(graph.nodes) <= bounds.max_keyframes - room * (LOADS - load) // (2 * LOADS):
             return False
         target = bounds.max_keyframes - room
         window = min(bounds.local_window, bounds.max_keyframes // 2)

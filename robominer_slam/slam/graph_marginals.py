@@ -83,6 +83,19 @@ class GraphMarginals:
         covariance[k:, k:] = 0.5 * (of_bias + of_bias.T)
         return covariance
 
+    def beside(self, node: int, other: int) -> tuple[FloatArray, FloatArray]:
+        """Of `joint_with_bias` of two nodes what concerns the first, for half of the work.
+
+        Returns:
+            Its covariance, shape (3, 3), and that of it with the other and the biases, shape (3, 3 + nb).
+        """
+        columns, others = self._columns([node]), self._columns([other])
+        solved, spread = np.asarray(self._factors.solve(columns)), columns.T @ self._by_bias
+        by_bias = np.linalg.solve(self._S, spread.T).T
+        own = columns.T @ solved + by_bias @ spread.T
+        across = solved.T @ others + by_bias @ (others.T @ self._by_bias).T
+        return 0.5 * (own + own.T), np.concatenate([across, -by_bias], axis=1)
+
     def _columns(self, nodes: list[int]) -> FloatArray:
         to_node = residuals.world_to_node(2, self._poses[nodes], self._pivot)
         selected = np.zeros((self._f, 3, len(nodes), 3))
@@ -117,9 +130,9 @@ class TrackedCovariance:
         self._base = None
 
     @property
-    def is_outdated(self) -> bool:
-        """Whether the next covariance asked for takes a factorisation."""
-        return self._base is None
+    def is_laborious(self) -> bool:
+        """Whether a factorisation was made at this keyframe, or the next covariance asked for takes one."""
+        return self._base is None or not self._tail
 
     def shrunk(self) -> None:
         """Keyframes have left the graph, and moved none of the others: it is factorised anew at the next keyframe."""
@@ -179,12 +192,9 @@ class TrackedCovariance:
             self.forget()
             base = self._prepare()
             row = int(np.searchsorted(self._ids, anchor))
-        if not self._tail:
-            joint = base.joint([row, len(self._ids) - 1])
-        else:
-            whole = base.joint_with_bias([row, len(self._ids) - 1])
-            across = whole[:3, 3:] @ self._way[:3].T
-            joint = np.block([[whole[:3, :3], across], [across.T, self._P[:3, :3]]])
+        own, beside = base.beside(row, len(self._ids) - 1)
+        across = beside @ self._way[:3].T
+        joint = np.block([[own, across], [across.T, self._P[:3, :3]]])
         Ad = geometry.se2_adjoint(geometry.se2_inverse(graph.relative(anchor, newest)))
         A = np.concatenate([-Ad, np.eye(3)], axis=1)
         return np.asarray(A @ joint @ A.T)

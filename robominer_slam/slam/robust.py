@@ -92,7 +92,7 @@ class RobustBackend:
             self._add_loop(closure)
         if accepted:
             self._optimise(accepted)
-        self._bound(keyframe.id, searched or self._tracked.is_outdated)
+        self._bound(keyframe.id, int(searched) + int(self._tracked.is_laborious))
         if self._last is not None:
             self._covariance = self._tracked.of_newest()
         self._last = keyframe
@@ -336,11 +336,11 @@ class RobustBackend:
 
     # ------------------------------------------------------------------------------------------------ bounds
 
-    def _bound(self, newest: int, busy: bool) -> None:
+    def _bound(self, newest: int, load: int) -> None:
         """Let go of touches and keyframes that are too many."""
         p = self._parameters.closure
         self._map.settle(newest, p.patch, p.partner_span, p.min_travel)
-        if self._map.shrink(busy):
+        if self._map.shrink(load):
             nodes = self._graph.nodes
             self._pending = [c for c in self._pending if c.i in nodes and c.j in nodes]
             self._recent = [c for c in self._recent if c.i in nodes and c.j in nodes]

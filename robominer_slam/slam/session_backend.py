@@ -87,9 +87,9 @@ class SessionBackend(RobustBackend):
         if self._last is not None:
             self._covariance = self._tracked.of_newest()
 
-    def _bound(self, newest: int, busy: bool) -> None:
+    def _bound(self, newest: int, load: int) -> None:
         if self.bounded:
-            super()._bound(newest, busy)
+            super()._bound(newest, load)
 
     def present(self, keyframe: Keyframe, closures: int) -> BackendResult:
         """The result as it is now, of the newest keyframe."""
