@@ -219,11 +219,14 @@ def test_a_console_that_stays_gets_the_latched_values_of_a_robot_that_restarts(e
         robot.latch("tf_static", b"first")
         assert inbox.next().payload == b"first"
         robot.close()
-        with ZenohBus(ZenohSettings(listen=(endpoint,)), PREFIX) as restarted:
-            # Before the console has found its way back.
-            assert restarted.links() == 0
-            restarted.latch("tf_static", b"second")
-            assert inbox.next().payload == b"second"
+        for _ in range(5):
+            with ZenohBus(ZenohSettings(listen=(endpoint,)), PREFIX) as restarted:
+                # On a busy machine the console may have found its way back already: then once more.
+                if restarted.links() == 0:
+                    restarted.latch("tf_static", b"second")
+                    assert inbox.next().payload == b"second"
+                    return
+        pytest.fail("the console was always back before the robot had anything to say")
 
 
 def test_wanted_says_whether_anybody_listens(robot: ZenohBus, console: ZenohBus) -> None:
