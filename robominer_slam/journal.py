@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import logging
 import os
-import socket
 import struct
 import sys
 from collections.abc import Mapping
+from logging.handlers import DatagramHandler
 
 SOCKET = "/run/systemd/journal/socket"
 #: syslog's levels by those of `logging`.
@@ -33,31 +33,23 @@ def priority(level: int) -> int:
     return next(number for least, number in PRIORITIES if level >= least)
 
 
-class JournalHandler(logging.Handler):
+class JournalHandler(DatagramHandler):
     """Sends to the journal; an entry that its socket does not take goes to stderr, each line with `<N>` before it."""
 
     def __init__(self, address: str = SOCKET) -> None:
-        super().__init__()
-        self._address = address
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+        super().__init__(address, None)
 
-    def emit(self, record: logging.LogRecord) -> None:
-        """Write a record."""
-        try:
-            text = self.format(record)
-            try:
-                self._socket.sendto(entry(record, text), self._address)
-            except OSError:
-                lines = (f"<{priority(record.levelno)}>{line}\n" for line in text.splitlines())
-                sys.stderr.write("".join(lines))
-                sys.stderr.flush()
-        except Exception:  # noqa: BLE001 - as every handler of `logging`: a log must not end what it reports on
-            self.handleError(record)
+    def makePickle(self, record: logging.LogRecord) -> bytes:  # the base class's name for what it sends
+        """The record as a datagram."""
+        return entry(record, self.format(record))
 
-    def close(self) -> None:
-        """Close the socket."""
-        self._socket.close()
-        super().close()
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Called by the base class in its handling of an error."""
+        if not isinstance(sys.exception(), OSError):
+            super().handleError(record)
+            return
+        sys.stderr.write("".join(f"<{priority(record.levelno)}>{line}\n" for line in self.format(record).splitlines()))
+        sys.stderr.flush()
 
 
 def entry(record: logging.LogRecord, text: str) -> bytes:
