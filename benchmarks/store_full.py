@@ -13,6 +13,7 @@ import shutil
 import sys
 import time
 import traceback
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -85,14 +86,17 @@ def main(disk: Path, rounds: int) -> None:
     logging.disable(logging.CRITICAL)
     done: list[tuple[bool, bool, int]] = []
     failed = 0
-    for seed in range(rounds):
-        try:
-            done.append(round_of(disk, seed))
-        except Exception:  # noqa: BLE001 - that nothing at all is raised is what is measured
-            failed += 1
-            print(f"seed {seed}:\n{traceback.format_exc()}", file=sys.stderr)
-        for file in disk.iterdir():
-            file.unlink()
+    with ThreadPoolExecutor(1) as pool:
+        for seed in range(rounds):
+            attempt = pool.submit(round_of, disk, seed)
+            if (error := attempt.exception()) is None:
+                done.append(attempt.result())
+            else:
+                failed += 1
+                print(f"seed {seed}:", file=sys.stderr)
+                traceback.print_exception(error)
+            for file in disk.iterdir():
+                file.unlink()
     full, damaged, lost = (sum(column) for column in zip(*done, strict=True))
     print(f"{rounds} rounds, {full} with a full disk, {damaged} damaged before; {failed} failed; {lost} keyframes lost")
     sys.exit(1 if failed or lost else 0)
