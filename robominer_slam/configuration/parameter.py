@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any
+from typing import Annotated, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+T = TypeVar("T")
 
 
 def _one_key_chunk(value: str) -> str:
@@ -38,14 +40,14 @@ class Section(BaseModel):
 
 
 def parameter(
-    default: object,
+    default: T,
     unit: str,
     reason: str,
     *,
     low: float | None = None,
     high: float | None = None,
-) -> Any:  # noqa: ANN401 - pydantic's own idiom: a field's declaration stands for its value
-    """Declare a parameter.
+) -> T:
+    """Declare a parameter: for the type checker its value, as with pydantic's own `Field`.
 
     Args:
         default: the value when the file says nothing.
