@@ -59,8 +59,7 @@ def reset(vendor: int, product: int, serial_number: str | None, backend: object 
             usb.util.dispose_resources(found[0])
     except usb.core.NoBackendError as error:
         raise UsbResetError("libusb is not installed") from error
-    # NotImplementedError is what a backend of pyusb raises that cannot reset.
-    except (usb.core.USBError, NotImplementedError) as error:
+    except usb.core.USBError as error:
         raise UsbResetError(f"refused: {error}") from error
 
 

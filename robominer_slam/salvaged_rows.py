@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from robominer_slam import geometry
 from robominer_slam.packed_points import pack_points, unpack_points
 from robominer_slam.slam.keyframe import GraphEdge
-from robominer_slam.store_changes import edge_row
+from robominer_slam.store_changes import EdgeRow, edge_row
 from robominer_slam.store_pages import Row, Value
 from robominer_slam.store_versions import NUMBERS
 
@@ -73,7 +73,7 @@ class SalvagedRows:
     def __init__(self) -> None:
         self.maps: dict[int, tuple[Value, Value, Value]] = {}
         self.keyframes: dict[Key, tuple[int, Values]] = {}
-        self.edges: dict[int, Values] = {}
+        self.edges: dict[int, EdgeRow] = {}
         self.sessions: dict[int, Values] = {}
         self.versions: dict[int, Values] = {}
         self.without_touches = 0
@@ -99,10 +99,11 @@ class SalvagedRows:
             case (int(number), int(identity), int(), _, _, _):
                 if 0 < number < LARGEST_ID and 0 <= identity < LARGEST_ID:
                     self._take_keyframe((number, identity), row)
-            case (int(number), "odometry" | "loop", int(i), int(j), T, bytes(information), int() | float() as weight):
+            case (int(number), "odometry" | "loop" as kind, int(i), int(j), bytes(T), bytes(information),
+                  int() | float() as weight):  # fmt: skip
                 finite = len(information) == INFORMATION_BYTES and np.isfinite(np.frombuffer(information, "<f4")).all()
                 if finite and not pose_fault(T) and 0.0 <= weight <= 1.0 and 0 < number < LARGEST_ID and i != j:
-                    self.edges[row.rowid] = values
+                    self.edges[row.rowid] = number, kind, i, j, T, information, weight
             case _:
                 pass  # of the schema or of an index, or its length or kind is damaged
 
@@ -122,7 +123,7 @@ class SalvagedRows:
 
     def bridge(self) -> None:
         """Drop edges to lost keyframes, and tie what hangs no more together by the poses of both sides."""
-        self._named |= {(int(e[0]), int(k)) for e in self.edges.values() for k in e[2:4]}  # type: ignore[arg-type]
+        self._named |= {(number, k) for number, _, i, j, *_ in self.edges.values() for k in (i, j)}
         kept = self.keyframes.keys()
         self.edges = {n: e for n, e in self.edges.items() if (e[0], e[2]) in kept and (e[0], e[3]) in kept}
         root = {key: key for key in kept}
@@ -134,7 +135,7 @@ class SalvagedRows:
             return key
 
         for number, _, i, j, *_ in self.edges.values():
-            a, b = sorted((find((number, i)), find((number, j))))  # type: ignore[arg-type]
+            a, b = sorted((find((number, i)), find((number, j))))
             root[b] = a
         free = max(self.edges, default=0) + 1
         before: Key | None = None
@@ -145,7 +146,7 @@ class SalvagedRows:
                 root[key] = find(before)
             before = key
 
-    def _bridge(self, a: Key, b: Key) -> Values:
+    def _bridge(self, a: Key, b: Key) -> EdgeRow:
         T_a, T_b = (geometry.from_vector7(np.frombuffer(self._pose(key), "<f8")) for key in (a, b))
         information = np.eye(6) / BRIDGE_SIGMA**2
         return edge_row(a[0], GraphEdge("odometry", a[1], b[1], geometry.inverse(T_a) @ T_b, information, 1.0))

@@ -6,6 +6,7 @@ import sqlite3
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ from robominer_slam.packed_points import pack_points, unpack_points
 from robominer_slam.slam.keyframe import BackendResult, GraphEdge, Keyframe, Merge
 
 FloatArray = NDArray[np.float64]
+#: A row of `edges`: map, kind, the two keyframes, packed pose and information, weight.
+EdgeRow: TypeAlias = tuple[int, str, int, int, bytes, bytes, float]
 UPPER = np.triu_indices(6)
 
 
@@ -136,7 +139,7 @@ def unpack_pose(data: bytes) -> FloatArray:
     return geometry.pose_matrix(vector[:3], vector[3:])
 
 
-def edge_row(map_id: int, edge: GraphEdge) -> tuple[int, str, int, int, bytes, bytes, float]:
+def edge_row(map_id: int, edge: GraphEdge) -> EdgeRow:
     """An edge as a row of `edges`."""
     information = edge.information[UPPER].astype("<f4").tobytes()
     return map_id, edge.kind, edge.i, edge.j, pack_pose(edge.T_i_j), information, edge.weight

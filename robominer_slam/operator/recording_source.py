@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Mapping
+from concurrent.futures import CancelledError
 from pathlib import Path
 from types import TracebackType
 
@@ -29,10 +30,6 @@ log = logging.getLogger(__name__)
 
 MAP_ID = 1
 _PLANAR_TERMS = ([0, 0, 1, 2], [0, 1, 1, 2])
-
-
-class _Cancelled(Exception):  # noqa: N818 - no error: the console was closed while the recording was read
-    """The reading is to end."""
 
 
 class RecordingSource:
@@ -87,14 +84,14 @@ class RecordingSource:
         """
         raise QueryError(f"map {number}: this is a recording: there are no saved maps")
 
-    def command(self, name: str, parameters: Mapping[str, str]) -> CommandResult:  # noqa: ARG002 - named as in `Session`
+    def command(self, _name: str, _parameters: Mapping[str, str], /) -> CommandResult:
         """Nobody is there to do anything."""
         return CommandResult(Outcome.REFUSED, "this is a recording: there is no robot to command")
 
     def _read(self) -> None:
         try:
             result = replay(self._inputs, self._on_frame, self._on_message, on_rest=self._take)
-        except _Cancelled:
+        except CancelledError:
             return
         except Exception as error:
             # Whatever it is: the operator must see that the rest is missing, and the log why.
@@ -109,7 +106,7 @@ class RecordingSource:
 
     def _on_message(self, log_time_ns: int) -> None:
         if self._stop.is_set():
-            raise _Cancelled
+            raise CancelledError
         if self._first_ns is None:
             self._first_ns = log_time_ns
         duration = max(self._inputs.recording.duration_ns, 1)

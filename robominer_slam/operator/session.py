@@ -36,5 +36,5 @@ class Session(Protocol):
             QueryError: it did not come.
         """
 
-    def command(self, name: str, parameters: Mapping[str, str]) -> CommandResult:
+    def command(self, name: str, parameters: Mapping[str, str], /) -> CommandResult:
         """Ask the robot to do something; waits for its answer."""

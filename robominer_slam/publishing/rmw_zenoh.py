@@ -63,7 +63,7 @@ class RmwZenohLayout:
         """The key of a topic's messages."""
         return f"{self._domain}{topic.name}/{dds_type(topic.typename)}/{topic.hash}"
 
-    def attachment(self, topic: RosTopic, session_id: str, sequence: int, sent_ns: int) -> bytes:
+    def attachment(self, topic: RosTopic, session_id: str, sequence: int, sent_ns: int, /) -> bytes:
         """Number, time and publisher of a message."""
         return _ATTACHMENT.pack(sequence, sent_ns, GID_BYTES, _gid(self._publisher(topic, session_id)))
 

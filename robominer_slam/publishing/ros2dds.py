@@ -48,7 +48,7 @@ class Ros2DdsLayout:
         key = topic.name.removeprefix("/")
         return None if key == self._own + topic.key else key
 
-    def attachment(self, topic: RosTopic, session_id: str, sequence: int, sent_ns: int) -> None:  # noqa: ARG002
+    def attachment(self, _topic: RosTopic, _session_id: str, _sequence: int, _sent_ns: int, /) -> None:
         """None."""
         return
 

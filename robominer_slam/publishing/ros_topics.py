@@ -56,7 +56,7 @@ class RosLayout(Protocol):
         """The whole key that a topic's messages go to; None where the robot's own key is the right one."""
         ...
 
-    def attachment(self, topic: RosTopic, session_id: str, sequence: int, sent_ns: int) -> bytes | None:
+    def attachment(self, topic: RosTopic, session_id: str, sequence: int, sent_ns: int, /) -> bytes | None:
         """What travels beside a message; `sequence` counts a topic's messages from 1."""
         ...
 

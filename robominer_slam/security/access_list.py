@@ -124,7 +124,7 @@ def load_access_list(path: Path) -> AccessList:
     return AccessList({holder.name: holder for holder in holders})
 
 
-def _holder(entry: Any) -> Holder:  # noqa: ANN401 - JSON
+def _holder(entry: Mapping[str, Any]) -> Holder:
     holder = Holder(**{**entry, "hosts": tuple(entry["hosts"])})
     checked_name(holder.name)
     if holder.role not in ROLES:

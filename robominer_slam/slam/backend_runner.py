@@ -7,6 +7,7 @@ are late take effect when they are ready, and their lateness is counted.
 
 from __future__ import annotations
 
+import logging
 import queue
 import threading
 import time
@@ -14,6 +15,8 @@ from collections import deque
 from typing import Protocol
 
 from robominer_slam.slam.keyframe import Backend, BackendResult, Keyframe, ReleasesMemory
+
+log = logging.getLogger(__name__)
 
 
 class BackendRunner(Protocol):
@@ -158,8 +161,10 @@ class ThreadedRunner:
                 start = time.perf_counter()
                 self._results.append(self._backend.process(keyframe))
                 self.busy_s += time.perf_counter() - start
-        except BaseException as error:  # noqa: BLE001 - raised in the front-end's thread at its next call
+        except BaseException as error:
+            # Raised in the front-end's thread at its next call: a thread must not die unseen.
             self._failure = error
+            log.exception("the back-end failed")
         finally:
             if isinstance(self._backend, ReleasesMemory):
                 self._backend.release()
