@@ -35,6 +35,7 @@ from robominer_slam.notify import Notifier
 from robominer_slam.publishing.robot_settings import robot_settings
 from robominer_slam.publishing.zenoh_session import ZenohBus
 from robominer_slam.replay import prepare
+from robominer_slam.service import keep_what_is_there
 from robominer_slam.store import MapStore
 from robominer_slam.supervision import Supervision
 from sim_backend import world as worlds
@@ -282,6 +283,7 @@ def main(hours: float, out: Path) -> None:
             execution="synchronous",
         )
         running.watch = watch
+        keep_what_is_there()
         running.run(stop)
     plot(watch.samples, out / "day.png")
     text = table(watch.samples)
