@@ -168,4 +168,5 @@ def test_guesses_on_the_way_to_one_place_are_followed_as_one():
     best = min(found, key=lambda match: match.cost)
     assert best.cost == pytest.approx(min(match.cost for match in each), rel=0.01)
     np.testing.assert_allclose(best.pose, np.zeros(4), atol=0.01)
-    assert any(np.allclose(match.pose, each[1].pose) for match in found), "another place is not affected"
+    other = max(found, key=lambda match: match.cost)
+    np.testing.assert_allclose(other.pose, each[1].pose, atol=0.02, err_msg="another place is not affected")

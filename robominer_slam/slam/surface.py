@@ -24,6 +24,8 @@ FloatArray = NDArray[np.float64]
 #: Touches that make up the surface at one place, at most and at least.
 NEIGHBOURS = 10
 LEAST_NEIGHBOURS = 4
+#: Touches in a leaf of the search tree: more of them make it sooner built, and searched as fast.
+LEAF = 24
 #: Of a plane: so many of the residuals go into the fit itself.
 UNKNOWNS = 3
 #: Symmetric matrices (3, 3) are kept as six entries, row by row from the diagonal on: where the diagonal is, and where
@@ -108,7 +110,7 @@ class Surface:
     def __init__(self, points: FloatArray, model: SurfaceModel) -> None:
         self.points = points
         self._model = model
-        self._tree = cKDTree(points[:, :2], balanced_tree=False, compact_nodes=False) if len(points) else None
+        self._tree = cKDTree(points[:, :2], LEAF, balanced_tree=False, compact_nodes=False) if len(points) else None
         # And one more: where the search finds too few touches, it tells an index past the end.
         self._rows = np.zeros((len(points) + 1, 3))
         self._rows[:-1] = points

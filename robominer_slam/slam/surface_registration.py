@@ -33,6 +33,8 @@ KERNEL_WIDTH = 2.5
 NOISE_MARGIN = 1.5
 #: Deviation of headings within a surface, rad.
 TURN_SIGMA = 0.03
+#: Of the touches, every so manieth shows which guesses are on the way to the same place.
+COARSE = 2
 #: Touches on known ground that a match takes at least: as many as it has unknowns.
 LEAST_KNOWN = 4
 #: Residuals under this many sigmas count as fitting.
@@ -138,15 +140,18 @@ def fit_each(
     Args:
         surface, points, guesses, prior_information, associations: as of `fit`.
         apart: guesses that come as near to one of less cost, m and rad, are on the way to the same place: they are
-            not followed, and have no match, unless one of all gets lost. None follows all of them.
+            not followed, and have no match, unless one of all gets lost. Up to the last look at the planes half of
+            the touches will do. None follows all of them, with all touches.
     """
     poses = guesses.copy()
     regular = prior_information + np.eye(4) * 1e-9
     pull = np.zeros((len(poses), 4, 1))
     for again in range(associations):
-        q = np.empty((len(poses), *points.shape))
+        last = again == associations - 1
+        some = points if apart is None or last else points[::COARSE]
+        q = np.empty((len(poses), *some.shape))
         for k, pose in enumerate(poses):
-            q[k] = placed(points, pose)
+            q[k] = placed(some, pose)
         patches = surface.at(q.reshape(-1, 3)[:, :2])
         known = patches.known.reshape(len(poses), -1)
         if min(map(np.count_nonzero, known)) < LEAST_KNOWN:
@@ -169,7 +174,7 @@ def fit_each(
             e = r + (step[:, None] @ J)[:, 0]
         gradient = (JtW @ e[:, :, None])[:, :, 0]
         poses = poses + step
-        if apart is not None and len(poses) > 1 and again < associations - 1:
+        if apart is not None and len(poses) > 1 and not last:
             squared, limit = np.square(e), INLIER_SIGMAS**2 * patches.variance.reshape(known.shape)
             costs = (np.minimum(squared, limit) * known).sum(axis=1) / known.sum(axis=1)
             followed = _distinct(poses, costs, *apart)
