@@ -5,8 +5,6 @@ searched (`closure_search`); what passes every check waits until another closure
 it; then both enter the graph. After optimising, closures that the graph contradicts are taken back, and those that
 it no longer contradicts return. Closures that agree with the present estimate move its last keyframes only; what the
 map keeps is bounded (`bounded_map`).
-
-Source: Latif et al., "Robust loop closing over time" (IJRR 2013), for taking closures back.
 """
 
 from __future__ import annotations
@@ -16,7 +14,8 @@ from numpy.typing import NDArray
 
 from robominer_slam import geometry
 from robominer_slam.configuration.robust_slam_section import RobustSlamSection
-from robominer_slam.slam.bias_walk import BiasWalk, faded_noise
+from robominer_slam.slam import taking_back
+from robominer_slam.slam.bias_walk import BiasWalk
 from robominer_slam.slam.bounded_map import BoundedMap
 from robominer_slam.slam.closure_agreement import agreeing
 from robominer_slam.slam.closure_counters import ClosureCounters
@@ -24,10 +23,10 @@ from robominer_slam.slam.closure_search import Closure, ClosureSearch, Patch
 from robominer_slam.slam.composite_scan import voxel_filter
 from robominer_slam.slam.graph_marginals import TrackedCovariance
 from robominer_slam.slam.keyframe import BackendResult, Keyframe
+from robominer_slam.slam.keyframe_edges import loop_edge, motion_of, odometry_edge, symmetric_inverse
 from robominer_slam.slam.keyframe_graph import KeyframeGraph
-from robominer_slam.slam.level_edges import LevelEdge
 from robominer_slam.slam.patch_memory import PatchMemory, PatchPages
-from robominer_slam.slam.published_edges import PLANAR, PublishedEdges
+from robominer_slam.slam.published_edges import PublishedEdges
 from robominer_slam.slam.surface import SurfaceModel
 from robominer_slam.slam.surface_registration import placed
 
@@ -35,19 +34,8 @@ FloatArray = NDArray[np.float64]
 
 #: A patch of fewer touches is too small to be told from others.
 LEAST_POINTS = 60
-#: Least variance of an odometry edge in x, y (m2) and heading (rad2): a keyframe's instant is known to 5 ms or so.
-EDGE_FLOOR = np.square([0.001, 0.001, 0.001])
-#: Deviation of the height from one keyframe to the next, m, where the odometry does not say.
-HEIGHT_WALK = 0.002
-HEIGHT_SIGMA = 0.003
 #: A patch as a whole is about its middle: of the drift from its oldest to its newest keyframe it has half.
 PATCH_SHARE = 0.5
-#: Median of chi-square with three degrees of freedom: of closures whose covariances are right.
-CHI2_MEDIAN = 2.366
-#: Fewer closures do not tell whether their covariances are too wide.
-LEAST_LIKES = 10
-#: A closure within its own sigma contradicts nobody.
-LEAST_LIMIT = 1.0
 
 
 class RobustBackend:
@@ -89,7 +77,7 @@ class RobustBackend:
         searched = keyframe.searched and self._is_searched(keyframe.id)
         accepted = self._agreed(self._found(keyframe)) if searched else []
         for closure in accepted:
-            self._add_loop(closure)
+            self._graph.edges.append(loop_edge(closure, self._graph.bias.size))
         if accepted:
             self._optimise(accepted)
         self._bound(keyframe.id, int(searched) + int(self._tracked.is_laborious))
@@ -110,35 +98,12 @@ class RobustBackend:
         if self._last is None:
             graph.nodes.append(k, level[:3], float(level[3]), tilt, keyframe.travelled)
             return
-        last, _ = geometry.levelled(self._last.T_odom_base)
-        Z = geometry.se2_compose(geometry.se2_inverse(last[:3]), level[:3])
-        dz = float(level[3] - last[3])
-        motion = keyframe.motion
-        if motion is None:
-            raise ValueError("the method needs the motion between keyframes; its odometry does not give it")
+        motion = motion_of(keyframe)
         nb = motion.bias.size if self._parameters.bias_unknown else 0
-        covariance = motion.covariance[np.ix_(PLANAR, PLANAR)]
-        if not nb:
-            J = motion.bias_jacobian[PLANAR]
-            covariance = covariance + J @ motion.bias_covariance @ J.T
-        information = _inverse(covariance + np.diag(EDGE_FLOOR))
         walk = None if motion.bias_walk is None else motion.bias_walk[:nb, :nb]
         self._walk.step(graph.edges, graph.bias, self._bias_covariance, walk)
         self._bias_covariance = motion.bias_covariance[:nb, :nb]
-        edge = LevelEdge(
-            "odometry",
-            self._last.id,
-            k,
-            Z,
-            information,
-            dz,
-            1.0 / HEIGHT_WALK**2,
-            motion.bias_jacobian[PLANAR][:, :nb],
-            motion.bias[:nb],
-            slack=None
-            if walk is None or not nb
-            else faded_noise(motion.bias_jacobian[PLANAR][:, :nb], self._bias_covariance, walk),
-        )
+        edge = odometry_edge(self._last, keyframe, nb)
         graph.edges.append(edge)
         if len(graph.nodes) <= self._parameters.bounds.local_window:
             self._tracked.forget()
@@ -146,10 +111,10 @@ class RobustBackend:
         # What the loops have taught of the biases stays; what the odometry has learned since is added.
         graph.bias = graph.bias + (posterior - graph.bias_prior) if graph.bias.size == nb else posterior.copy()
         graph.bias_prior = posterior
-        graph.bias_prior_information = _inverse(motion.bias_covariance[:nb, :nb] + 1e-14 * np.eye(nb))
+        graph.bias_prior_information = symmetric_inverse(motion.bias_covariance[:nb, :nb] + 1e-14 * np.eye(nb))
         step = geometry.se2_exp(edge.jacobian @ (graph.bias - edge.reference))
-        pose = geometry.se2_compose(graph.nodes[self._last.id], geometry.se2_compose(Z, step))
-        graph.nodes.append(k, pose, graph.nodes.height(self._last.id) + dz, tilt, keyframe.travelled)
+        pose = geometry.se2_compose(graph.nodes[self._last.id], geometry.se2_compose(edge.Z, step))
+        graph.nodes.append(k, pose, graph.nodes.height(self._last.id) + edge.dz, tilt, keyframe.travelled)
         self._tracked.follow(edge, graph.bias, walk)
 
     def _source(self, keyframe: Keyframe) -> tuple[FloatArray, int]:
@@ -259,23 +224,6 @@ class RobustBackend:
         self._recent += accepted
         return accepted
 
-    def _add_loop(self, closure: Closure) -> None:
-        nb = self._graph.bias.size
-        information = _inverse(closure.covariance)
-        self._graph.edges.append(
-            LevelEdge(
-                "loop",
-                closure.i,
-                closure.j,
-                closure.Z,
-                information,
-                closure.dz,
-                1.0 / HEIGHT_SIGMA**2,
-                np.zeros((3, nb)),
-                np.zeros(nb),
-            )
-        )
-
     # -------------------------------------------------------------------------------------------- optimising
 
     def _optimise(self, accepted: list[Closure]) -> None:
@@ -288,13 +236,16 @@ class RobustBackend:
         if not large and len(graph.nodes) > bounds.local_window:
             graph.optimise_window(bounds.local_window)
             edges = graph.edges
-            contradicted = edges.loop & edges.enabled & (edges.chi2 > self._limit())
-            if not contradicted.any():
+            limit = taking_back.limit(edges, self._parameters.closure.take_back)
+            if not (edges.loop & edges.enabled & (edges.chi2 > limit)).any():
                 self._tracked.closed(len(accepted), self._predicted, self._parameters.closure.max_sigma)
                 return
         self._since_full = 0
         self._optimise_whole()
         self._tracked.forget()
+
+    def _optimise_whole(self) -> None:
+        taking_back.optimise(self._graph, self._parameters.closure.take_back, self.closures)
 
     def _is_far(self, closure: Closure) -> bool:
         """Whether a closure moves its keyframe by more than the last keyframes can take."""
@@ -302,37 +253,6 @@ class RobustBackend:
         off = geometry.se2_compose(geometry.se2_inverse(self._graph.relative(closure.i, closure.j)), closure.Z)
         moved, turned = float(np.hypot(off[0], off[1])), abs(float(off[2]))
         return moved > bounds.local_distance or turned > np.deg2rad(bounds.local_angle_deg)
-
-    def _limit(self) -> float:
-        """Chi-square beyond which a closure is contradicted.
-
-        Where the closures as a whole fit better than their covariances say, these are too wide, and one that stands
-        out among its likes is wrong though its own covariance would allow for it: the limit shrinks with the median.
-        """
-        edges, take_back = self._graph.edges, self._parameters.closure.take_back
-        on = edges.loop & edges.enabled
-        if int(on.sum()) < LEAST_LIKES:
-            return take_back
-        spread = float(np.median(edges.chi2[on])) / CHI2_MEDIAN
-        return min(take_back, max(take_back * spread, LEAST_LIMIT))
-
-    def _optimise_whole(self) -> None:
-        """Optimise; take back what the optimum contradicts, let return what it no longer does; until that settles."""
-        edges = self._graph.edges
-        for _ in range(4):
-            self._graph.optimise()
-            limit = self._limit()
-            on = edges.loop & edges.enabled
-            worst = float(edges.chi2[on].max(initial=0.0))
-            if worst > limit:
-                switched, back = on & (edges.chi2 > max(limit, 0.5 * worst)), False
-            else:
-                switched, back = edges.loop & ~edges.enabled & (edges.chi2 <= 0.5 * limit), True
-            if not switched.any():
-                return
-            self.closures.counts["returned" if back else "taken_back"] += int(switched.sum())
-            edges.switch(switched, back)
-        self._graph.optimise()
 
     # ------------------------------------------------------------------------------------------------ bounds
 
@@ -382,9 +302,3 @@ class RobustBackend:
                 "points.fetched": self._patches.fetched,
             },
         )
-
-
-def _inverse(matrix: FloatArray) -> FloatArray:
-    """Inverse of a covariance or an information matrix, symmetric to the bit."""
-    inverse = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
-    return 0.5 * (inverse + inverse.T)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from robominer_slam import geometry
 from robominer_slam.slam.closure_search import Closure, Patch
 from robominer_slam.slam.keyframe import BackendResult, Keyframe
+from robominer_slam.slam.keyframe_edges import loop_edge
 from robominer_slam.slam.level_edges import LevelEdge
 from robominer_slam.slam.level_map import LevelMap
 from robominer_slam.slam.robust import RobustBackend
@@ -76,7 +77,7 @@ class SessionBackend(RobustBackend):
         for edge in known.edges:
             graph.edges.append(_with_biases(edge, nb))
         for tie in ties:
-            self._add_loop(tie)
+            graph.edges.append(loop_edge(tie, nb))
         self.closures.counts["accepted"] += len(ties)
         self._closed = max((tie.j for tie in ties), default=self._closed)
         self._recent = list(ties)
