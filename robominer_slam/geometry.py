@@ -43,6 +43,7 @@ from robominer_slam.geometry_rotations import (
     quaternion_of,
     quaternion_to_matrix,
     rpy_of,
+    sine_coefficient,
     so3_exp,
     so3_left_jacobian,
     so3_left_jacobian_inverse,
@@ -150,8 +151,20 @@ def normalise_pose(T: ArrayLike) -> FloatArray:
 def se3_exp(twist: ArrayLike) -> FloatArray:
     """Pose matrices (..., 4, 4) of twists (v, omega), shape (..., 6)."""
     xi = np.asarray(twist, dtype=np.float64)
-    v, w = xi[..., :3], xi[..., 3:]
-    return from_rotation_translation(so3_exp(w), (so3_left_jacobian(w) @ v[..., None])[..., 0])
+    # As `so3_exp` and `so3_left_jacobian`, what the two share computed once.
+    w = xi[..., 3:]
+    x2 = squared_norm(w)
+    angle = np.sqrt(x2)
+    a, b = np.sinc(angle / np.pi), 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
+    c = sine_coefficient(x2)
+    cross = hat(w)
+    cross2 = cross @ cross
+    unit = np.eye(3)
+    out = np.zeros((*xi.shape[:-1], 4, 4))
+    out[..., :3, :3] = unit + a[..., None, None] * cross + b[..., None, None] * cross2
+    out[..., :3, 3:] = (unit + b[..., None, None] * cross + c[..., None, None] * cross2) @ xi[..., :3, None]
+    out[..., 3, 3] = 1.0
+    return out
 
 
 def se3_log(T: ArrayLike) -> FloatArray:
@@ -171,15 +184,15 @@ def se3_adjoint(T: ArrayLike) -> FloatArray:
     return out
 
 
-def se3_right_jacobian_inverse(twist: ArrayLike) -> FloatArray:
-    """Jr^-1 (..., 6, 6) of twists (v, omega), |omega| < 2 pi.
+def se3_right_jacobian_inverse(twist: ArrayLike, translation: FloatArray | None = None) -> FloatArray:
+    """Jr^-1 (..., 6, 6) of twists (v, omega), |omega| < 2 pi; `translation` (..., 3) of Exp(twist), if it is known.
 
     From Log itself: omega' = omega + Jr3^-1 d_omega, and v = V^-1(omega) t with t' = t + R d_v, where
     V^-1(omega) t = t - omega x t / 2 + c omega x (omega x t); the corner block is its derivative by omega.
     """
     xi = np.asarray(twist, dtype=np.float64)
     w = xi[..., 3:]
-    t = (so3_left_jacobian(w) @ xi[..., :3, None])[..., 0]
+    t = (so3_left_jacobian(w) @ xi[..., :3, None])[..., 0] if translation is None else translation
     x2 = squared_norm(w)
     c = cot_coefficient(x2)
     cross = hat(w)

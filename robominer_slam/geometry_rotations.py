@@ -27,6 +27,7 @@ _COT_SERIES = (
     1.0 / 74724249600.0,
     3617.0 / 10670622842880000.0,
 )
+_COT_SLOPE_SERIES = tuple(2.0 * (k + 1) * b for k, b in enumerate(_COT_SERIES[1:]))
 # (x - sin x) / x^3 = sum of (-1)^n x^2n / (2n + 3)!
 _SINE_SERIES = (1.0 / 6.0, -1.0 / 120.0, 1.0 / 5040.0, -1.0 / 362880.0, 1.0 / 39916800.0, -1.0 / 6227020800.0)
 # Below this squared angle (0.5 rad) the series are exact to rounding; above it the closed forms are.
@@ -34,15 +35,18 @@ _SERIES_BELOW = 0.25
 
 
 def _series(x2: FloatArray, coefficients: tuple[float, ...]) -> FloatArray:
-    total = np.full_like(x2, coefficients[-1])
-    for coefficient in reversed(coefficients[:-1]):
-        total = total * x2 + coefficient
-    return total
+    total = coefficients[-1] * x2
+    for coefficient in coefficients[-2:0:-1]:
+        total += coefficient
+        total *= x2
+    return total + coefficients[0]
 
 
 def cot_coefficient(x2: FloatArray) -> FloatArray:
     """(1 - (x/2) cot(x/2)) / x^2 for x^2 < (2 pi)^2."""
     small = x2 < _SERIES_BELOW
+    if np.count_nonzero(small) == small.size:
+        return _series(x2, _COT_SERIES)
     safe = np.where(small, 1.0, x2)
     half = 0.5 * np.sqrt(safe)
     return np.where(small, _series(x2, _COT_SERIES), (1.0 - half * np.cos(half) / np.sin(half)) / safe)
@@ -51,16 +55,19 @@ def cot_coefficient(x2: FloatArray) -> FloatArray:
 def cot_coefficient_slope(x2: FloatArray, c: FloatArray) -> FloatArray:
     """Derivative of `cot_coefficient` by x, divided by x; `c` is the coefficient itself."""
     small = x2 < _SERIES_BELOW
+    if np.count_nonzero(small) == small.size:
+        return _series(x2, _COT_SLOPE_SERIES)
     safe = np.where(small, 1.0, x2)
     x = np.sqrt(safe)
-    slope_series = tuple(2.0 * (k + 1) * b for k, b in enumerate(_COT_SERIES[1:]))
     closed = ((1.0 - np.sinc(x / np.pi)) / (2.0 * (1.0 - np.cos(x))) - 2.0 * c) / safe
-    return np.where(small, _series(x2, slope_series), closed)
+    return np.where(small, _series(x2, _COT_SLOPE_SERIES), closed)
 
 
 def sine_coefficient(x2: FloatArray) -> FloatArray:
     """(x - sin x) / x^3."""
     small = x2 < _SERIES_BELOW
+    if np.count_nonzero(small) == small.size:
+        return _series(x2, _SINE_SERIES)
     safe = np.where(small, 1.0, x2)
     return np.where(small, _series(x2, _SINE_SERIES), (1.0 - np.sinc(np.sqrt(safe) / np.pi)) / safe)
 
@@ -75,6 +82,8 @@ def wrap_angle(angle: ArrayLike | float) -> FloatArray:
     if isinstance(angle, float) and -math.pi < angle < math.pi:
         return np.asarray(angle, dtype=np.float64)
     a = np.asarray(angle, dtype=np.float64)
+    if np.count_nonzero(np.abs(a) < np.pi) == a.size:
+        return a.copy()
     wrapped = a - 2.0 * np.pi * np.rint(a / (2.0 * np.pi))
     return np.where(np.abs(wrapped) >= np.pi, np.pi, wrapped)
 
@@ -118,11 +127,19 @@ def matrix_to_quaternion(R: ArrayLike) -> FloatArray:
     if m.ndim == 2:
         return np.array(quaternion_of(*m.tolist()))
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    ww = 1.0 + xx + yy + zz
+    if (ww > 2.0).all():  # angles below 90 degrees: the last column is the longest
+        q = np.empty((*ww.shape, 4))
+        q[..., 0] = m[..., 2, 1] - m[..., 1, 2]
+        q[..., 1] = m[..., 0, 2] - m[..., 2, 0]
+        q[..., 2] = m[..., 1, 0] - m[..., 0, 1]
+        q[..., 3] = ww
+        return np.asarray(q / np.sqrt(squared_norm(q))[..., None])
     K = np.empty((*m.shape[:-2], 4, 4))
     K[..., 0, 0] = 1.0 + xx - yy - zz
     K[..., 1, 1] = 1.0 - xx + yy - zz
     K[..., 2, 2] = 1.0 - xx - yy + zz
-    K[..., 3, 3] = 1.0 + xx + yy + zz
+    K[..., 3, 3] = ww
     K[..., 0, 1] = K[..., 1, 0] = m[..., 1, 0] + m[..., 0, 1]
     K[..., 0, 2] = K[..., 2, 0] = m[..., 2, 0] + m[..., 0, 2]
     K[..., 1, 2] = K[..., 2, 1] = m[..., 2, 1] + m[..., 1, 2]

@@ -8,12 +8,21 @@ from scipy.integrate import quad
 
 from robominer_slam import geometry as g
 from robominer_slam.slam import pose_graph_residuals as residuals
+from robominer_slam.slam.dense_system import DenseSystem
 from robominer_slam.slam.g2o_format import parse_g2o
+from robominer_slam.slam.linear_system import solution
 from robominer_slam.slam.pose_graph import PoseGraph, PoseGraphError
-from robominer_slam.slam.pose_graph_optimizer import Kernels, OptimizationOptions, edge_costs, normal_equations
+from robominer_slam.slam.pose_graph_optimizer import (
+    Kernels,
+    OptimizationOptions,
+    edge_costs,
+    minimise,
+    normal_equations,
+)
 from robominer_slam.slam.pose_graph_residuals import EdgeArrays
-from robominer_slam.slam.pose_graph_system import SystemPattern
+from robominer_slam.slam.pose_graph_system import normal_system
 from robominer_slam.slam.robust_kernels import KERNEL_NAMES, kernel_code, robust_cost_and_weight
+from robominer_slam.slam.sparse_system import SparseSystem
 from tests.pose_graph_problems import (
     MADE_GRAPHS,
     PUBLIC_OPTIMA,
@@ -62,7 +71,7 @@ class TestJacobians:
         m = graph.edge_count
         kernels = Kernels(np.full(m, kernel_code("cauchy"), np.int8), np.full(m, 2.0))
         fixed = np.arange(n) == 0
-        system = SystemPattern(edges.i, edges.j, fixed, d)
+        system = normal_system(edges.i, edges.j, fixed, d)
         pivot = residuals.positions(dim, poses).mean(axis=0)
         costs = edge_costs(edges, kernels, poses, convention)
         gradient, _ = normal_equations(edges, costs, poses, pivot, system, convention)
@@ -76,14 +85,15 @@ class TestJacobians:
                 numeric = (up - down) / (4.0 * h)
                 assert gradient[place, component] == pytest.approx(numeric, rel=1e-5, abs=1e-6 * np.abs(gradient).max())
 
+    @pytest.mark.parametrize("System", [DenseSystem, SparseSystem])
     @pytest.mark.parametrize("dim", [2, 3])
-    def test_assembled_matrix_is_the_sum_over_edges_made_one_by_one(self, dim):
+    def test_assembled_matrix_is_the_sum_over_edges_made_one_by_one(self, dim, System):
         graph = MADE_GRAPHS["ring" if dim == 2 else "grid_3d"]()
         d, n, m = (3 if dim == 2 else 6), graph.node_count, graph.edge_count
         i, j = graph.edge_nodes.T
         fixed = np.zeros(n, dtype=bool)
         fixed[[0, 7]] = True
-        system = SystemPattern(i, j, fixed, d)
+        system = System(i, j, fixed, d)
         blocks = random_information(np.random.default_rng(1), m, d)
         H = np.zeros((n, d, n, d))
         for k in range(m):
@@ -94,8 +104,33 @@ class TestJacobians:
         size = system.free_nodes.size * d
         H = H[system.free_nodes][:, :, system.free_nodes].reshape(size, size)
         right = np.random.default_rng(2).normal(size=(system.free_nodes.size, d))
-        x = system.solve(system.factorise(system.hessian_blocks(blocks)), right)
+        x = solution(system.factorise(blocks), right)
         np.testing.assert_allclose(x.ravel(), np.linalg.solve(H, right.ravel()), rtol=1e-9, atol=1e-12)
+
+
+class TestDenseAndSparse:
+    @pytest.mark.parametrize("make", MADE_GRAPHS.values(), ids=MADE_GRAPHS)
+    @pytest.mark.parametrize(
+        ("convention", "kernel", "held"), [("gtsam", None, [0]), ("g2o", "huber", [0, 5]), ("gtsam", "cauchy", [3, 9])]
+    )
+    def test_both_find_the_same_poses_in_the_same_steps(self, make, convention, kernel, held):
+        graph = make()
+        edges = EdgeArrays(
+            graph.dim, *graph.edge_nodes.T, invert(graph.dim, graph.edge_measurements), graph.edge_information
+        )
+        kernels = Kernels(np.full(graph.edge_count, kernel_code(kernel), np.int8), np.full(graph.edge_count, 2.0))
+        fixed = np.zeros(graph.node_count, dtype=bool)
+        fixed[held] = True
+        options = OptimizationOptions(convention=convention, relative_tolerance=1e-10)
+        dense, sparse = (
+            minimise(edges, kernels, graph.poses, System(edges.i, edges.j, fixed, 3 if graph.dim == 2 else 6), options)
+            for System in (DenseSystem, SparseSystem)
+        )
+        assert np.abs(sparse.poses - graph.poses).max() > 0.1, "the start is so near that the test shows nothing"
+        assert dense.converged
+        assert dense.iterations == sparse.iterations
+        np.testing.assert_allclose(dense.poses, sparse.poses, atol=1e-9)
+        np.testing.assert_allclose(dense.after.weights, sparse.after.weights, atol=1e-9)
 
 
 class TestAgainstGtsam:

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from robominer_slam import geometry as g
+from robominer_slam.slam.linear_system import LinearSystem
 from robominer_slam.slam.pose_graph import PoseGraph
 from robominer_slam.slam.pose_graph_bias import BiasProblem, solve
 from robominer_slam.slam.pose_graph_optimizer import Kernels, OptimizationOptions
-from robominer_slam.slam.pose_graph_system import SystemPattern
+from robominer_slam.slam.pose_graph_system import normal_system
 from tests.pose_graph_problems import ring
 
 BIAS = np.array([0.03, -0.02, 0.01])
@@ -41,10 +42,10 @@ def biased_ring(seed: int = 0, noise: float = 0.01) -> tuple[BiasProblem, np.nda
     return problem, np.array(poses)
 
 
-def system_of(problem: BiasProblem, n: int) -> tuple[SystemPattern, Kernels]:
+def system_of(problem: BiasProblem, n: int) -> tuple[LinearSystem, Kernels]:
     m = len(problem.i)
     return (
-        SystemPattern(problem.i, problem.j, np.arange(n) == 0, 3),
+        normal_system(problem.i, problem.j, np.arange(n) == 0, 3),
         Kernels(np.zeros(m, dtype=np.int8), np.ones(m)),
     )
 

@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from robominer_slam import geometry
 from robominer_slam.slam import pose_graph_bias
 from robominer_slam.slam import pose_graph_residuals as residuals
+from robominer_slam.slam.linear_system import LinearSystem
 from robominer_slam.slam.pose_graph_bias import BiasProblem
 from robominer_slam.slam.pose_graph_optimizer import Kernels
-from robominer_slam.slam.pose_graph_system import SystemPattern
 
 if TYPE_CHECKING:
     from robominer_slam.slam.keyframe_graph import KeyframeGraph
@@ -36,7 +36,7 @@ FloatArray = NDArray[np.float64]
 
 
 class GraphMarginals:
-    """Covariances of a graph's nodes; holds SuperLU factors: use and drop it in one thread.
+    """Covariances of a graph's nodes; holds the graph's factors: use and drop it in one thread.
 
     Args:
         problem, kernels, system: the graph.
@@ -49,7 +49,7 @@ class GraphMarginals:
         kernels: Kernels,
         poses: FloatArray,
         bias: FloatArray,
-        system: SystemPattern,
+        system: LinearSystem,
     ) -> None:
         self._poses = poses
         self._pivot = poses[:, :2].mean(axis=0)

@@ -22,9 +22,10 @@ from robominer_slam.slam import pose_graph_bias
 from robominer_slam.slam.graph_marginals import GraphMarginals
 from robominer_slam.slam.keyframe_nodes import KeyframeNodes
 from robominer_slam.slam.level_edges import LevelEdge, LevelEdges
+from robominer_slam.slam.linear_system import LinearSystem
 from robominer_slam.slam.pose_graph_bias import BiasProblem
 from robominer_slam.slam.pose_graph_optimizer import Kernels
-from robominer_slam.slam.pose_graph_system import SystemPattern
+from robominer_slam.slam.pose_graph_system import normal_system
 
 __all__ = ["KeyframeGraph", "LevelEdge"]
 
@@ -50,7 +51,7 @@ class KeyframeGraph:
         self.bias_prior: FloatArray = np.zeros(0)
         self.bias_prior_information: FloatArray = np.zeros((0, 0))
         self.loose_bridges = 0
-        self._pattern: tuple[tuple[int, int], SystemPattern] | None = None
+        self._system: tuple[tuple[int, int], LinearSystem] | None = None
 
     def optimise(self) -> None:
         """Move all keyframes and the biases to the least squared error; the first keyframe stays."""
@@ -83,7 +84,7 @@ class KeyframeGraph:
             np.zeros(0),
             np.zeros((0, 0)),
         )
-        system = SystemPattern(problem.i, problem.j, nodes < first, 3)
+        system = normal_system(problem.i, problem.j, nodes < first, 3)
         kernels = Kernels(np.zeros(len(rows), dtype=np.int8), np.ones(len(rows)))
         found = pose_graph_bias.solve(problem, kernels, self.nodes.poses[nodes], np.zeros(0), system)
         self.nodes.poses[nodes] = found.poses
@@ -141,7 +142,7 @@ class KeyframeGraph:
         rows = np.flatnonzero(chosen)
         return self.nodes.rows(self.edges.i[rows]), self.nodes.rows(self.edges.j[rows]), rows
 
-    def problem(self) -> tuple[BiasProblem, SystemPattern, Kernels]:
+    def problem(self) -> tuple[BiasProblem, LinearSystem, Kernels]:
         """The edges that count as least squares over poses and biases, by places of nodes; all without kernels."""
         edges = self.edges
         i, j, rows = self._ends(edges.enabled)
@@ -157,11 +158,11 @@ class KeyframeGraph:
         )
         kernels = Kernels(np.zeros(len(rows), dtype=np.int8), np.ones(len(rows)))
         version = (self.nodes.version, edges.version)
-        if self._pattern is None or self._pattern[0] != version:
+        if self._system is None or self._system[0] != version:
             fixed = np.zeros(len(self.nodes), dtype=np.bool_)
             fixed[0] = True
-            self._pattern = version, SystemPattern(problem.i, problem.j, fixed, 3)
-        return problem, self._pattern[1], kernels
+            self._system = version, normal_system(problem.i, problem.j, fixed, 3)
+        return problem, self._system[1], kernels
 
     def _solve_heights(self, first: int) -> None:
         """Heights of least squared error of the nodes from place `first` on; those before stay."""

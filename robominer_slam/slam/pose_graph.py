@@ -7,7 +7,6 @@ calls, so optimising after each keyframe of a growing graph costs one or two lin
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from time import perf_counter
 from typing import Literal
 
@@ -18,49 +17,19 @@ from robominer_slam import geometry
 from robominer_slam.geometry import FloatArray
 from robominer_slam.slam import pose_graph_residuals as residuals
 from robominer_slam.slam.growing_array import GrowingArray
+from robominer_slam.slam.linear_system import LinearSystem, SingularSystemError
 from robominer_slam.slam.pose_graph_covariance import (
     joint_covariance,
     relative_covariances,
     sampled_relative_covariances,
 )
-from robominer_slam.slam.pose_graph_input import (
-    PoseGraphError,
-    check_ends,
-    check_joined,
-    checked_information,
-    checked_poses,
-)
-from robominer_slam.slam.pose_graph_optimizer import Kernels, OptimizationOptions, edge_costs, minimise
+from robominer_slam.slam.pose_graph_edges import EdgeKind, PoseGraphEdges
+from robominer_slam.slam.pose_graph_input import PoseGraphError, check_joined, checked_poses
+from robominer_slam.slam.pose_graph_optimizer import OptimizationOptions, OptimizationResult, edge_costs, minimise
 from robominer_slam.slam.pose_graph_residuals import Convention, EdgeArrays
-from robominer_slam.slam.pose_graph_system import SingularSystemError, SystemPattern
-from robominer_slam.slam.robust_kernels import kernel_code
-
-EdgeKind = Literal["odometry", "loop"]
+from robominer_slam.slam.pose_graph_system import normal_system
 
 __all__ = ["EdgeKind", "OptimizationOptions", "OptimizationResult", "PoseGraph", "PoseGraphError"]
-
-
-@dataclass(frozen=True, slots=True)
-class OptimizationResult:
-    """What one optimisation did.
-
-    Attributes:
-        chi2_before, chi2_after: sum of e' Omega e over the enabled edges, without kernels.
-        cost_before, cost_after: the same through the kernels: what was minimised. Equal to chi2 without kernels.
-        iterations: linear systems solved.
-        converged: what is left to gain is below the tolerance.
-        seconds: wall time.
-        weights: of the kernels at the end, per edge in (0, 1]; 0 for a disabled edge; shape (m,).
-    """
-
-    chi2_before: float
-    chi2_after: float
-    cost_before: float
-    cost_after: float
-    iterations: int
-    converged: bool
-    seconds: float
-    weights: FloatArray
 
 
 class PoseGraph:
@@ -80,18 +49,10 @@ class PoseGraph:
             raise PoseGraphError(f"dim is {dim}; expected 2 or 3")
         self.dim = dim
         self._d = 3 if dim == 2 else 6
-        pose_shape = (3,) if dim == 2 else (4, 4)
-        self._poses = GrowingArray(pose_shape, np.float64)
-        self._i = GrowingArray((), np.int64)
-        self._j = GrowingArray((), np.int64)
-        self._Z_inverse = GrowingArray(pose_shape, np.float64)
-        self._information = GrowingArray((self._d, self._d), np.float64)
-        self._kernel = GrowingArray((), np.int8)
-        self._kernel_width = GrowingArray((), np.float64)
-        self._enabled = GrowingArray((), np.bool_)
-        self._kinds: list[EdgeKind] = []
+        self._poses = GrowingArray((3,) if dim == 2 else (4, 4), np.float64)
+        self._edges = PoseGraphEdges(dim)
         self._fixed: set[int] = {0}
-        self._system: SystemPattern | None = None
+        self._system: LinearSystem | None = None
 
     # ------------------------------------------------------------------------------------------------ data
 
@@ -103,7 +64,7 @@ class PoseGraph:
     @property
     def edge_count(self) -> int:
         """Number of edges, disabled ones included."""
-        return len(self._i)
+        return len(self._edges)
 
     @property
     def poses(self) -> FloatArray:
@@ -117,28 +78,27 @@ class PoseGraph:
     @property
     def edge_nodes(self) -> NDArray[np.int64]:
         """Nodes (i, j) of all edges, shape (m, 2)."""
-        return np.stack([self._i.view, self._j.view], axis=-1)
+        return np.stack([self._edges.i.view, self._edges.j.view], axis=-1)
 
     @property
     def edge_kinds(self) -> tuple[EdgeKind, ...]:
         """Kind of each edge."""
-        return tuple(self._kinds)
+        return tuple(self._edges.kinds)
 
     @property
     def edge_enabled(self) -> NDArray[np.bool_]:
         """Whether each edge counts, shape (m,)."""
-        return np.array(self._enabled.view)
+        return np.array(self._edges.enabled.view)
 
     @property
     def edge_measurements(self) -> FloatArray:
         """T_i_j of all edges, (m, 3) or (m, 4, 4)."""
-        Z_inverse = self._Z_inverse.view
-        return geometry.se2_inverse(Z_inverse) if self.dim == 2 else geometry.inverse(Z_inverse)
+        return self._edges.measurements
 
     @property
     def edge_information(self) -> FloatArray:
         """Omega of all edges, shape (m, d, d)."""
-        return np.array(self._information.view)
+        return np.array(self._edges.information.view)
 
     @property
     def fixed_nodes(self) -> tuple[int, ...]:
@@ -199,26 +159,13 @@ class PoseGraph:
             PoseGraphError: a node does not exist, an edge joins a node with itself, a measurement is no pose, an
                 information matrix is not symmetric and positive semidefinite, or the kernel is not known.
         """
-        a, b = np.asarray(i, dtype=np.int64), np.asarray(j, dtype=np.int64)
-        first = self.edge_count
-        check_ends(a, b, self.node_count, first)
-        measurement = checked_poses(self.dim, T_i_j, a.size, "measurement")
-        Omega = checked_information(self._d, information, a.size)
-        code = _checked_kernel(kernel, kernel_width)
-        self._i.extend(a)
-        self._j.extend(b)
-        self._Z_inverse.extend(geometry.se2_inverse(measurement) if self.dim == 2 else geometry.inverse(measurement))
-        self._information.extend(Omega)
-        self._kernel.extend(np.full(a.size, code))
-        self._kernel_width.extend(np.full(a.size, kernel_width))
-        self._enabled.extend(np.ones(a.size, dtype=np.bool_))
-        self._kinds.extend([kind] * a.size)
+        added = self._edges.add(self.node_count, i, j, T_i_j, information, kind, kernel, kernel_width)
         self._system = None
-        return np.arange(first, self.edge_count)
+        return added
 
     def set_edge_enabled(self, edges: int | Sequence[int] | NDArray[np.int64], enabled: bool) -> None:
         """Take edges back (they stay listed but count for nothing), or let them count again."""
-        self._enabled.view[edges] = enabled
+        self._edges.enabled.view[edges] = enabled
         self._system = None
 
     def set_edge_kernel(
@@ -229,8 +176,7 @@ class PoseGraph:
         Raises:
             PoseGraphError: the kernel is not known, or its width is no number above 0.
         """
-        self._kernel.view[edges] = _checked_kernel(kernel, kernel_width)
-        self._kernel_width.view[edges] = kernel_width
+        self._edges.set_kernel(edges, kernel, kernel_width)
 
     def fix(self, nodes: Sequence[int]) -> None:
         """Fix these nodes, and no others, where they are (by default node 0).
@@ -248,14 +194,12 @@ class PoseGraph:
 
     def edge_chi2(self, convention: Convention = "gtsam") -> FloatArray:
         """Squared errors e' Omega e of all edges, disabled ones too, at the present poses; no kernels; shape (m,)."""
-        everything = np.ones(self.edge_count, dtype=np.bool_)
-        return edge_costs(
-            self._edge_arrays(everything), self._kernels(everything), self._poses.view, convention
-        ).squared
+        edges, kernels = self._edges.arrays(disabled_too=True)
+        return edge_costs(edges, kernels, self._poses.view, convention).squared
 
     def chi2(self, convention: Convention = "gtsam") -> float:
         """Sum of e' Omega e over the enabled edges, without kernels."""
-        return float(self.edge_chi2(convention)[self._enabled.view].sum())
+        return float(self.edge_chi2(convention)[self._edges.enabled.view].sum())
 
     def optimize(self, options: OptimizationOptions | None = None) -> OptimizationResult:
         """Move the nodes to the minimum of the cost near their present poses.
@@ -266,8 +210,8 @@ class PoseGraph:
         """
         options = options or OptimizationOptions()
         started = perf_counter()
-        enabled = self._enabled.view
-        edges, kernels, system = self._edge_arrays(enabled), self._kernels(enabled), self._pattern()
+        edges, kernels = self._edges.arrays()
+        system = self._normal_system(edges)
         try:
             found = minimise(edges, kernels, self._poses.view, system, options)
         except SingularSystemError as error:
@@ -280,7 +224,7 @@ class PoseGraph:
             free = system.free_nodes
             self._poses.view[free] = geometry.normalise_pose(found.poses[free])
         weights = np.zeros(self.edge_count)
-        weights[enabled] = found.after.weights
+        weights[self._edges.enabled.view] = found.after.weights
         return OptimizationResult(
             chi2_before=float(found.before.squared.sum()),
             chi2_after=float(found.after.squared.sum()),
@@ -301,11 +245,9 @@ class PoseGraph:
         Raises:
             PoseGraphError: as `optimize`.
         """
-        enabled = self._enabled.view
+        edges, kernels = self._edges.arrays()
         try:
-            return joint_covariance(
-                self._edge_arrays(enabled), self._kernels(enabled), self._poses.view, self._pattern(), nodes
-            )
+            return joint_covariance(edges, kernels, self._poses.view, self._normal_system(edges), nodes)
         except SingularSystemError as error:
             raise PoseGraphError(f"the edges do not determine all poses ({error})") from error
 
@@ -334,8 +276,9 @@ class PoseGraph:
         Raises:
             PoseGraphError: as `optimize`.
         """
-        enabled, chosen = self._enabled.view, np.asarray(pairs, dtype=np.int64).reshape(-1, 2)
-        edges, kernels, system = self._edge_arrays(enabled), self._kernels(enabled), self._pattern()
+        chosen = np.asarray(pairs, dtype=np.int64).reshape(-1, 2)
+        edges, kernels = self._edges.arrays()
+        system = self._normal_system(edges)
         try:
             if samples is None:
                 return relative_covariances(edges, kernels, self._poses.view, system, chosen)
@@ -345,33 +288,12 @@ class PoseGraph:
 
     # ---------------------------------------------------------------------------------------------- internals
 
-    def _edge_arrays(self, which: NDArray[np.bool_]) -> EdgeArrays:
-        k = slice(None) if which.all() else np.flatnonzero(which)
-        return EdgeArrays(
-            self.dim, self._i.view[k], self._j.view[k], self._Z_inverse.view[k], self._information.view[k]
-        )
-
-    def _kernels(self, which: NDArray[np.bool_]) -> Kernels:
-        return Kernels(self._kernel.view[which], self._kernel_width.view[which])
-
-    def _pattern(self) -> SystemPattern:
+    def _normal_system(self, edges: EdgeArrays) -> LinearSystem:
         if self._system is None:
             if self.node_count == 0:
                 raise PoseGraphError("the graph has no node; add the first pose before optimising")
-            enabled = self._enabled.view
-            i, j = self._i.view[enabled], self._j.view[enabled]
             fixed = np.zeros(self.node_count, dtype=np.bool_)
             fixed[list(self._fixed)] = True
-            check_joined(i, j, fixed)
-            self._system = SystemPattern(i, j, fixed, self._d)
+            check_joined(edges.i, edges.j, fixed)
+            self._system = normal_system(edges.i, edges.j, fixed, self._d)
         return self._system
-
-
-def _checked_kernel(kernel: str | None, width: float) -> int:
-    try:
-        code = kernel_code(kernel)
-    except ValueError as error:
-        raise PoseGraphError(str(error)) from error
-    if not (np.isfinite(width) and width > 0.0):
-        raise PoseGraphError(f"kernel width is {width}; expected a number above 0, in sigmas")
-    return code

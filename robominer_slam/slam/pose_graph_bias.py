@@ -6,7 +6,7 @@ this edge and b0 the values that Z was made with. With a prior on b, Gauss-Newto
     [ H_xx  H_xb ] [dx]     [g_x]
     [ H_bx  H_bb ] [db] = - [g_b],
 
-where H_xx is the sparse matrix of `pose_graph_system` and the bias's few columns are eliminated first (a Schur
+where H_xx is the matrix of `linear_system` and the bias's few columns are eliminated first (a Schur
 complement): one factorisation serves all of them. Errors e = Log(Z(b)^-1 X_i^-1 X_j); de/db = -B to first order in e.
 
 Sources: Grisetti et al., "A tutorial on graph-based SLAM" (2010); Forster et al., "On-manifold preintegration" (T-RO
@@ -19,13 +19,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.linalg import SuperLU
 
 from robominer_slam import geometry
 from robominer_slam.slam import pose_graph_residuals as residuals
+from robominer_slam.slam.linear_system import Factors, LinearSystem
 from robominer_slam.slam.pose_graph_optimizer import EdgeCosts, Kernels, edge_costs
 from robominer_slam.slam.pose_graph_residuals import EdgeArrays
-from robominer_slam.slam.pose_graph_system import SystemPattern
 
 FloatArray = NDArray[np.float64]
 
@@ -84,7 +83,7 @@ def solve(
     kernels: Kernels,
     poses: FloatArray,
     bias: FloatArray,
-    system: SystemPattern,
+    system: LinearSystem,
     max_iterations: int = 10,
     tolerance: float = 1e-6,
 ) -> BiasSolution:
@@ -94,7 +93,7 @@ def solve(
         problem: edges and prior.
         kernels: robust kernels of the edges.
         poses, bias: where to start, shapes (n, 3) and (nb,).
-        system: pattern of the same edges.
+        system: normal equations of the same edges.
         max_iterations: linear systems solved at most.
         tolerance: stop when a step promises less than this share of the cost.
 
@@ -140,18 +139,18 @@ def linearised(
     poses: FloatArray,
     bias: FloatArray,
     pivot: FloatArray,
-    system: SystemPattern,
-) -> tuple[SuperLU, FloatArray, FloatArray, float, FloatArray, FloatArray]:
+    system: LinearSystem,
+) -> tuple[Factors, FloatArray, FloatArray, float, FloatArray, FloatArray]:
     """Solve the normal equations once.
 
     Returns:
         Factors of H_xx, steps of poses (f, 3) and bias (nb,), promised gain, H_xx^-1 H_xb (3 f, nb), and the bias's
         information when the poses are eliminated (nb, nb).
     """
-    J = residuals.error_slopes(2, costs.E, costs.e, "gtsam") @ residuals.world_to_node(2, poses, pivot)[problem.j]
+    J = residuals.jacobians(2, costs.E, costs.e, poses, problem.j, pivot, "gtsam")
     weighted = costs.weights[:, None, None] * problem.information
     J_Omega = J.transpose(0, 2, 1) @ weighted
-    factors = system.factorise(system.hessian_blocks(J_Omega @ J))
+    factors = system.factorise(J_Omega @ J)
     # The errors and the bias's columns together: what the edges have of H_xb and of the gradient sums up likewise.
     nb, m = bias.size, len(problem.i)
     columns = np.empty((m, 3, 1 + nb))

@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 
 from robominer_slam.geometry import FloatArray
 from robominer_slam.slam import pose_graph_residuals as residuals
+from robominer_slam.slam.linear_system import LinearSystem
 from robominer_slam.slam.pose_graph_optimizer import Kernels, edge_costs, normal_equations
 from robominer_slam.slam.pose_graph_residuals import EdgeArrays
-from robominer_slam.slam.pose_graph_system import SystemPattern
 
 #: Pairs whose columns are solved for in one go: bounds the memory.
 _PAIRS_AT_ONCE = 64
 
 
 def joint_covariance(
-    edges: EdgeArrays, kernels: Kernels, poses: FloatArray, system: SystemPattern, nodes: Sequence[int]
+    edges: EdgeArrays, kernels: Kernels, poses: FloatArray, system: LinearSystem, nodes: Sequence[int]
 ) -> FloatArray:
     """Joint covariance of chosen nodes, shape (k d, k d), each as a twist in its own frame; 0 for fixed nodes.
 
@@ -30,7 +30,7 @@ def joint_covariance(
     d, k, f = system.block_size, len(nodes), system.free_nodes.size
     if f == 0:
         return np.zeros((k * d, k * d))
-    pivot = residuals.positions(edges.dim, poses).mean(axis=0)
+    pivot = residuals.pivot_of(edges.dim, poses)
     costs = edge_costs(edges, kernels, poses, "gtsam")
     _, blocks = normal_equations(edges, costs, poses, pivot, system, "gtsam")
     place = np.full(poses.shape[0], -1)
@@ -49,7 +49,7 @@ def sampled_relative_covariances(
     edges: EdgeArrays,
     kernels: Kernels,
     poses: FloatArray,
-    system: SystemPattern,
+    system: LinearSystem,
     pairs: NDArray[np.int64],
     samples: int,
     seed: int,
@@ -66,10 +66,10 @@ def sampled_relative_covariances(
     d, f = system.block_size, system.free_nodes.size
     if f == 0 or pairs.shape[0] == 0:
         return np.zeros((pairs.shape[0], d, d))
-    pivot = residuals.positions(edges.dim, poses).mean(axis=0)
+    pivot = residuals.pivot_of(edges.dim, poses)
     costs = edge_costs(edges, kernels, poses, "gtsam")
     to_node = residuals.world_to_node(edges.dim, poses, pivot)
-    J = residuals.error_slopes(edges.dim, costs.E, costs.e, "gtsam") @ to_node[edges.j]
+    J = residuals.jacobians(edges.dim, costs.E, costs.e, poses, edges.j, pivot, "gtsam")
     information = costs.weights[:, None, None] * edges.information
     values, vectors = np.linalg.eigh(information)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
@@ -77,7 +77,7 @@ def sampled_relative_covariances(
     noise = np.random.default_rng(seed).integers(0, 2, size=(edges.i.size, d, samples), dtype=np.int8) * 2.0 - 1.0
     pushes = (np.swapaxes(J, -1, -2) @ root) @ noise
     right_side = system.gradient(pushes.reshape(edges.i.size, d * samples)).reshape(f * d, samples)
-    factors = system.factorise(system.hessian_blocks(np.swapaxes(J, -1, -2) @ information @ J))
+    factors = system.factorise(np.swapaxes(J, -1, -2) @ information @ J)
     drawn = np.zeros((poses.shape[0], d, samples))
     drawn[system.free_nodes] = factors.solve(right_side).reshape(f, d, samples)
     i, j = pairs.T
@@ -86,7 +86,7 @@ def sampled_relative_covariances(
 
 
 def relative_covariances(
-    edges: EdgeArrays, kernels: Kernels, poses: FloatArray, system: SystemPattern, pairs: NDArray[np.int64]
+    edges: EdgeArrays, kernels: Kernels, poses: FloatArray, system: LinearSystem, pairs: NDArray[np.int64]
 ) -> FloatArray:
     """Covariances of X_i^-1 X_j, exact, shape (k, d, d), as twists in the frame of j: d columns are solved per pair.
 
@@ -97,7 +97,7 @@ def relative_covariances(
     out = np.zeros((pairs.shape[0], d, d))
     if f == 0 or pairs.shape[0] == 0:
         return out
-    pivot = residuals.positions(edges.dim, poses).mean(axis=0)
+    pivot = residuals.pivot_of(edges.dim, poses)
     costs = edge_costs(edges, kernels, poses, "gtsam")
     _, blocks = normal_equations(edges, costs, poses, pivot, system, "gtsam")
     factors = system.factorise(blocks)

@@ -9,6 +9,9 @@ from scipy.sparse.csgraph import connected_components
 
 from robominer_slam.geometry import FloatArray
 
+#: Up to so many edges the parts of a graph are found in Python.
+_FEW_EDGES = 200
+
 
 class PoseGraphError(ValueError):
     """A graph that cannot be built or solved; the message says which node or edge, and what was expected."""
@@ -80,10 +83,31 @@ def check_joined(i: NDArray[np.int64], j: NDArray[np.int64], fixed: NDArray[np.b
         PoseGraphError: a node is adrift.
     """
     n = fixed.size
-    _, component = connected_components(coo_matrix((np.ones(i.size), (i, j)), shape=(n, n)), directed=False)
-    adrift = np.flatnonzero(~np.isin(component, component[fixed]))
+    component = _components(i, j, n)
+    held = np.zeros(n, dtype=np.bool_)
+    held[component[fixed]] = True
+    adrift = np.flatnonzero(~held[component])
     if adrift.size:
         raise PoseGraphError(
             f"node {adrift[0]} is not joined to a fixed node by enabled edges ({adrift.size} of {n} nodes are not); "
             "add edges or fix one of them"
         )
+
+
+def _components(i: NDArray[np.int64], j: NDArray[np.int64], n: int) -> NDArray[np.intp]:
+    """A number per node, shape (n,), the same for nodes that edges (i, j) join by whatever way."""
+    if i.size > _FEW_EDGES:
+        _, component = connected_components(coo_matrix((np.ones(i.size), (i, j)), shape=(n, n)), directed=False)
+        return np.asarray(component, dtype=np.intp)
+    # Union by the lesser number: scipy's would take longer for its matrix alone than a small graph for everything.
+    leader = list(range(n))
+
+    def leader_of(node: int) -> int:
+        while leader[node] != node:
+            leader[node] = node = leader[leader[node]]
+        return node
+
+    for a, b in zip(i.tolist(), j.tolist(), strict=True):
+        first, second = sorted((leader_of(a), leader_of(b)))
+        leader[second] = first
+    return np.array([leader_of(node) for node in range(n)])

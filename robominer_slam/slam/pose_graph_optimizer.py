@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from robominer_slam.geometry import FloatArray
 from robominer_slam.slam import pose_graph_residuals as residuals
+from robominer_slam.slam.linear_system import LinearSystem, solution
 from robominer_slam.slam.pose_graph_residuals import Convention, EdgeArrays
-from robominer_slam.slam.pose_graph_system import SystemPattern
 from robominer_slam.slam.robust_kernels import robust_cost_and_weight
 
 #: Lengths tried along a step, as shares of it.
@@ -99,13 +99,36 @@ class Minimum:
     converged: bool
 
 
+@dataclass(frozen=True, slots=True)
+class OptimizationResult:
+    """What one optimisation did.
+
+    Attributes:
+        chi2_before, chi2_after: sum of e' Omega e over the enabled edges, without kernels.
+        cost_before, cost_after: the same through the kernels: what was minimised. Equal to chi2 without kernels.
+        iterations: linear systems solved.
+        converged: what is left to gain is below the tolerance.
+        seconds: wall time.
+        weights: of the kernels at the end, per edge in (0, 1]; 0 for a disabled edge; shape (m,).
+    """
+
+    chi2_before: float
+    chi2_after: float
+    cost_before: float
+    cost_after: float
+    iterations: int
+    converged: bool
+    seconds: float
+    weights: FloatArray
+
+
 def edge_costs(edges: EdgeArrays, kernels: Kernels, poses: FloatArray, convention: Convention) -> EdgeCosts:
     """Errors, weights and cost of all edges at `poses`."""
     E = residuals.error_poses(edges, poses)
     e = residuals.error_vectors(edges.dim, E, convention)
-    squared = np.einsum("mi,mi->m", (edges.information @ e[..., None])[..., 0], e)
+    squared = np.add.reduce((edges.information @ e[..., None])[..., 0] * e, axis=1)
     cost, weights = robust_cost_and_weight(squared, kernels.codes, kernels.widths)
-    return EdgeCosts(E, e, squared, weights, float(cost.sum()))
+    return EdgeCosts(E, e, squared, weights, float(np.add.reduce(cost)))
 
 
 def normal_equations(
@@ -113,19 +136,18 @@ def normal_equations(
     costs: EdgeCosts,
     poses: FloatArray,
     pivot: FloatArray,
-    system: SystemPattern,
+    system: LinearSystem,
     convention: Convention,
 ) -> tuple[FloatArray, FloatArray]:
-    """Gradient (f, d) and blocks of H (see `SystemPattern.hessian_blocks`) for steps about `pivot`."""
-    to_node = residuals.world_to_node(edges.dim, poses, pivot)
-    J = residuals.error_slopes(edges.dim, costs.E, costs.e, convention) @ to_node[edges.j]
-    J_Omega = np.swapaxes(J, -1, -2) @ (costs.weights[:, None, None] * edges.information)
+    """Gradient (f, d), and the edges' blocks J' Omega J (m, d, d) that make up H, for steps about `pivot`."""
+    J = residuals.jacobians(edges.dim, costs.E, costs.e, poses, edges.j, pivot, convention)
+    J_Omega = J.swapaxes(-1, -2) @ (costs.weights[:, None, None] * edges.information)
     gradient = system.gradient((J_Omega @ costs.e[..., None])[..., 0])
-    return gradient, system.hessian_blocks(J_Omega @ J)
+    return gradient, J_Omega @ J
 
 
 def minimise(
-    edges: EdgeArrays, kernels: Kernels, poses: FloatArray, system: SystemPattern, options: OptimizationOptions
+    edges: EdgeArrays, kernels: Kernels, poses: FloatArray, system: LinearSystem, options: OptimizationOptions
 ) -> Minimum:
     """Poses of least cost near `poses`.
 
@@ -133,7 +155,7 @@ def minimise(
         edges: the edges that count; `system` was built for them.
         kernels: their robust kernels.
         poses: where to start, (n, 3) or (n, 4, 4).
-        system: sparsity pattern; nodes that it does not list as free keep their pose.
+        system: their normal equations; nodes that it does not list as free keep their pose.
         options: convention and limits.
 
     Raises:
@@ -145,15 +167,16 @@ def minimise(
     iterations, converged, last_gain = 0, current.cost <= negligible, 0.0
     while not converged and iterations < options.max_iterations:
         iterations += 1
-        pivot = residuals.positions(edges.dim, poses).mean(axis=0)
+        pivot = residuals.pivot_of(edges.dim, poses)
         gradient, blocks = normal_equations(edges, current, poses, pivot, system, options.convention)
-        steps = system.solve(system.factorise(blocks), -gradient)
+        steps = solution(system.factorise(blocks), -gradient)
         # By the linear model the whole step gains this, a part t of it (2 - t) t times this.
         promised = -float(np.vdot(gradient, steps))
         tolerance = options.relative_tolerance * current.cost + negligible
+        start = poses.take(free, axis=0)
         for length in _STEP_LENGTHS:
             candidate = poses.copy()
-            candidate[free] = residuals.perturbed(edges.dim, poses[free], length * steps, pivot)
+            candidate[free] = residuals.perturbed(edges.dim, start, length * steps, pivot)
             costs = edge_costs(edges, kernels, candidate, options.convention)
             gain = current.cost - costs.cost
             if gain >= _LEAST_GAIN * length * promised or promised <= tolerance:

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from robominer_slam import geometry
 from robominer_slam.geometry import FloatArray
+from robominer_slam.slam import planar_residuals
 
 Convention = Literal["gtsam", "g2o"]
 IntArray = NDArray[np.int64]
@@ -58,16 +59,15 @@ def relative_poses(dim: int, poses: FloatArray, i: IntArray, j: IntArray) -> Flo
 
 def error_poses(edges: EdgeArrays, poses: FloatArray) -> FloatArray:
     """E = Z^-1 X_i^-1 X_j per edge, shape (m, 3) or (m, 4, 4)."""
-    relative = relative_poses(edges.dim, poses, edges.i, edges.j)
     if edges.dim == 2:
-        return geometry.se2_compose(edges.Z_inverse, relative)
-    return np.asarray(edges.Z_inverse @ relative)
+        return planar_residuals.error_poses(poses, edges.i, edges.j, edges.Z_inverse)
+    return np.asarray(edges.Z_inverse @ relative_poses(3, poses, edges.i, edges.j))
 
 
 def error_vectors(dim: int, E: FloatArray, convention: Convention) -> FloatArray:
     """Error vectors (m, d) of the error poses `E`, translation first."""
     if dim == 2:
-        return E if convention == "g2o" else geometry.se2_log(E)
+        return E if convention == "g2o" else planar_residuals.logarithms(E)
     if convention == "gtsam":
         return geometry.se3_log(E)
     return geometry.to_vector7(E)[..., :6]
@@ -76,7 +76,9 @@ def error_vectors(dim: int, E: FloatArray, convention: Convention) -> FloatArray
 def error_slopes(dim: int, E: FloatArray, e: FloatArray, convention: Convention) -> FloatArray:
     """Derivative (m, d, d) of the error by eta, where E <- E Exp(eta)."""
     if convention == "gtsam":
-        return geometry.se2_right_jacobian_inverse(e) if dim == 2 else geometry.se3_right_jacobian_inverse(e)
+        if dim == 2:
+            return geometry.se2_right_jacobian_inverse(e)
+        return geometry.se3_right_jacobian_inverse(e, E[..., :3, 3])
     out = np.zeros((*e.shape, e.shape[-1]))
     if dim == 2:
         out[..., :2, :2] = geometry.rotation_2d(E[..., 2])
@@ -107,6 +109,29 @@ def world_to_node(dim: int, poses: FloatArray, pivot: FloatArray) -> FloatArray:
     return geometry.se3_adjoint(geometry.inverse(centred))
 
 
+def jacobians(
+    dim: int, E: FloatArray, e: FloatArray, poses: FloatArray, j: IntArray, pivot: FloatArray, convention: Convention
+) -> FloatArray:
+    """Derivatives (m, d, d) of the edges' errors by the steps d_j about `pivot`; those by d_i are their negatives.
+
+    Args:
+        dim: 2 or 3.
+        E, e: error poses and error vectors of the edges.
+        poses: of all nodes.
+        j: the edges' second nodes, shape (m,).
+        pivot: shape (dim,), m.
+        convention: of the error vectors.
+    """
+    if dim == 2:
+        return planar_residuals.jacobians(E, poses[j], pivot, convention == "gtsam")
+    return np.asarray(error_slopes(3, E, e, convention) @ world_to_node(3, poses, pivot)[j])
+
+
+def pivot_of(dim: int, poses: FloatArray) -> FloatArray:
+    """Middle of the nodes, shape (dim,), m: what steps are made about."""
+    return np.asarray(np.add.reduce(positions(dim, poses)) / poses.shape[0])
+
+
 def positions(dim: int, poses: FloatArray) -> FloatArray:
     """Positions of the nodes, shape (n, 2) or (n, 3), m."""
     return poses[:, :2] if dim == 2 else poses[:, :3, 3]
@@ -114,12 +139,9 @@ def positions(dim: int, poses: FloatArray) -> FloatArray:
 
 def perturbed(dim: int, poses: FloatArray, steps: FloatArray, pivot: FloatArray) -> FloatArray:
     """C Exp(d) C^-1 X per node: the poses after `steps` (n, d) about `pivot`."""
-    moved = poses.copy()
     if dim == 2:
-        moved[:, :2] -= pivot
-        moved = geometry.se2_compose(geometry.se2_exp(steps), moved)
-        moved[:, :2] += pivot
-        return moved
+        return planar_residuals.perturbed(poses, steps, pivot)
+    moved = poses.copy()
     moved[:, :3, 3] -= pivot
     moved = geometry.se3_exp(steps) @ moved
     moved[:, :3, 3] += pivot

@@ -56,7 +56,9 @@ def robust_cost_and_weight(s: FloatArray, codes: NDArray[np.int8], widths: Float
     Returns:
         rho and w, both of shape (m,); w in (0, 1].
     """
-    cost, weight = s.copy(), np.ones_like(s)
+    cost, weight = s.copy(), np.ones(s.size)
+    if not np.count_nonzero(codes):
+        return cost, weight
     for code in np.unique(codes[codes > 0]):
         k = np.flatnonzero(codes == code)
         cost[k], weight[k] = _one_kernel(int(code), s[k], widths[k] ** 2)
