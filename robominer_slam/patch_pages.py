@@ -23,7 +23,7 @@ class SqlitePages:
         self._folder = folder
         self._connection: sqlite3.Connection | None = None
 
-    def write(self, key: int, points: FloatArray) -> None:
+    def write(self, key: int, points: NDArray[np.float32]) -> None:
         """Keep the touches of a keyframe, shape (m, 3), m, as float32."""
         data = np.asarray(points, dtype="<f4").tobytes()
         self._do("INSERT OR REPLACE INTO patches VALUES (?, ?)", (key, data))

@@ -57,6 +57,6 @@ class BoundedMapSection(Section):
         high=0.2,
     )  # fmt: skip
     max_points_in_memory: int = parameter(
-        300_000, "1", "touches that stay in memory (24 byte each); more are paged to disk", low=10_000,
+        300_000, "1", "touches that stay in memory (12 byte each); more are paged to disk", low=10_000,
         high=1_000_000_000,
     )  # fmt: skip

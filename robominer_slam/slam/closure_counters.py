@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 
 import numpy as np
 
 from robominer_slam.configuration.robust_slam_section import ClosureSection
 from robominer_slam.slam.closure_search import Closure
 
-#: Closures that are remembered one by one.
-REMEMBERED = 256
-
 
 class ClosureCounters:
-    """Counts; of the closures themselves only the last are kept.
+    """Counts.
 
     Attributes:
-        counts: `accepted`, `taken_back`, `returned`, and `refused.<reason>`.
-        last: closures found lately, good or not.
+        counts: `found`, `accepted`, `taken_back`, `returned`, and `refused.<reason>`.
     """
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
-        self.last: deque[Closure] = deque(maxlen=REMEMBERED)
 
     def found(self, closure: Closure, parameters: ClosureSection) -> None:
         """A search has found a place."""
-        self.last.append(closure)
         self.counts["found" if closure.good else f"refused.{refusal(closure, parameters)}"] += 1
 
 
