@@ -31,6 +31,7 @@ from robominer_slam import daemon
 from robominer_slam.calibrated_array import CalibratedArray
 from robominer_slam.configuration.reload import Reload
 from robominer_slam.frame_result import FrameResult
+from robominer_slam.heap import give_large_blocks_back
 from robominer_slam.notify import Notifier
 from robominer_slam.publishing.robot_settings import robot_settings
 from robominer_slam.publishing.zenoh_session import ZenohBus
@@ -284,6 +285,7 @@ def main(hours: float, out: Path) -> None:
         )
         running.watch = watch
         keep_what_is_there()
+        give_large_blocks_back()
         running.run(stop)
     plot(watch.samples, out / "day.png")
     text = table(watch.samples)

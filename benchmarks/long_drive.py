@@ -25,6 +25,7 @@ from robominer_slam import geometry
 from robominer_slam.configuration.model import MapSection
 from robominer_slam.configuration.robust_slam_section import RobustSlamSection
 from robominer_slam.estimation.keyframe_motion import KeyframeMotion
+from robominer_slam.heap import give_large_blocks_back
 from robominer_slam.mapping.keyframe_map import KeyframeMap
 from robominer_slam.patch_pages import SqlitePages
 from robominer_slam.publishing.map_stream import MapStreamEncoder
@@ -212,6 +213,7 @@ def main() -> None:
     if arguments.max_keyframes is not None:
         bounds = parameters.bounds.model_copy(update={"max_keyframes": arguments.max_keyframes})
         parameters = parameters.model_copy(update={"bounds": bounds})
+    give_large_blocks_back()  # as the daemon does
     print(HEAD)
     for block in run(arguments.area, arguments.seed, arguments.keyframes, arguments.block, parameters):
         print(block.line(), flush=True)

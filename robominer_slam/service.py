@@ -18,6 +18,7 @@ from robominer_slam.configuration.model import Configuration
 from robominer_slam.configuration.reload import Reload
 from robominer_slam.daemon import Daemon
 from robominer_slam.drivers_daemon import forward
+from robominer_slam.heap import give_large_blocks_back
 from robominer_slam.notify import Notifier
 from robominer_slam.publishing.robot_settings import robot_settings
 from robominer_slam.publishing.zenoh_session import ZenohBus
@@ -83,6 +84,7 @@ def serve(configuration: Configuration, reload: Reload, stop: threading.Event) -
         stack.enter_context(source)
         daemon = Daemon(configuration, array, source, bus, store, supervision, known)
         keep_what_is_there()
+        give_large_blocks_back()
         daemon.run(stop)
 
 

@@ -33,6 +33,7 @@ from robominer_slam.configuration.devices import device_settings
 from robominer_slam.configuration.reload import Reload
 from robominer_slam.contacts import ContactModel
 from robominer_slam.estimation.robust_odometry import RobustOdometry
+from robominer_slam.heap import give_large_blocks_back
 from robominer_slam.map_service import MapService
 from robominer_slam.notify import Notifier
 from robominer_slam.pipeline import Pipeline
@@ -211,6 +212,7 @@ def main() -> None:
                 execution="synchronous",
             )
             keep_what_is_there()
+            give_large_blocks_back()
             stages.begin("main loop")
             running.run(stop)
             stages.begin("end")
