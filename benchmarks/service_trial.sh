@@ -2,10 +2,12 @@
 # The unit under a real systemd, as it is shipped and shut in: systemd as process 1 of namespaces of its own, with the
 # host's network and a simulated robot. As root, on a machine with cgroup2 and overlayfs; a minute and a half.
 #   benchmarks/service_trial.sh .venv/bin/python
-# Not shown here: real serial devices (DeviceAllow=) and udev; pseudo-terminals are always allowed.
+# Not shown here: real serial devices (DeviceAllow=) and udev; pseudo-terminals are always allowed. Keys come by the
+# lines that are commented out in the unit.
 set -euo pipefail
 python=$(realpath -s "${1:?path of the Python to use}")
 root=$(cd "$(dirname "$0")/.." && pwd)
+tcp=tcp/127.0.0.1:17947 tls=tls/127.0.0.1:17948
 
 boot() { # inside the namespaces; $1: the robot's folder
   mount --make-rprivate /
@@ -31,7 +33,11 @@ exec /opt/python/bin/python3 -c 'from robominer_slam.cli.main import main; main(
 PROGRAM
   chmod 755 /usr/bin/robominer-slam
   cp "$1/calibration.json" /etc/robominer-slam/
-  sed "s#^path = .*#path = \"/var/lib/robominer-slam/map.db\"#" "$1/config.toml" >/etc/robominer-slam/config.toml
+  sed -e "s#^path = .*#path = \"/var/lib/robominer-slam/map.db\"#" -e "s#^listen = .*#listen = [\"$tcp\", \"$tls\"]#" \
+    -e 's#^\[zenoh\]#&\ncredentials = "/run/credentials/robominer-slam.service"#' "$1/config.toml" \
+    >/etc/robominer-slam/config.toml
+  cp -r "$1/keys/holders/rm3" /etc/robominer-slam/keys
+  chown -R 0:0 /etc/robominer-slam/keys
   systemd-sysusers "$root/systemd/sysusers.d/robominer-slam.conf"
   for link in "$1"/dev/*; do
     port=$(readlink -f "$link")
@@ -40,13 +46,15 @@ PROGRAM
   done
   units=/run/systemd/system
   mkdir -p $units
-  cp "$root/systemd/robominer-slam.service" $units/
+  sed 's/^#LoadCredential=/LoadCredential=/' "$root/systemd/robominer-slam.service" >$units/robominer-slam.service
   for target in basic sysinit shutdown multi-user network-online; do
     printf '[Unit]\nDefaultDependencies=no\n' >$units/$target.target
   done
   printf '[Unit]\nDefaultDependencies=no\nWants=systemd-journald.service robominer-slam.service\n' >$units/trial.target
   cp /lib/systemd/system/systemd-journald{.service,.socket,-dev-log.socket} $units/
   sed -i 's/^Sockets=.*/Sockets=systemd-journald.socket systemd-journald-dev-log.socket/' $units/systemd-journald.service
+  # Credentials reach a service's folder by a mount that spreads.
+  mount --make-rshared /
   export container=trial SYSTEMD_UNIT_PATH=$units
   exec /lib/systemd/systemd --system --unit=trial.target --log-target=console </dev/null
 }
@@ -70,8 +78,12 @@ finish() {
 }
 trap finish EXIT
 chmod 755 "$work"
-PYTHONPATH=$root "$python" -c 'from robominer_slam.cli.main import main; main()' simulate --scenario 0 \
-  --engine quasi-static --out "$work" --listen tcp/127.0.0.1:17947 --json >"$work/simulator.log" 2>&1 &
+program=(env "PYTHONPATH=$root" "$python" -c 'from robominer_slam.cli.main import main; main()')
+for words in init 'issue alice --role operator' 'issue rm3 --role robot --host 127.0.0.1'; do
+  # shellcheck disable=SC2086
+  "${program[@]}" keys $words --folder "$work/keys" >/dev/null
+done
+"${program[@]}" simulate --scenario 0 --engine quasi-static --out "$work" --listen $tcp --json >"$work/simulator.log" 2>&1 &
 simulator=$!
 until [[ -s $work/simulator.log ]]; do kill -0 $simulator; sleep 0.2; done
 mkdir -p "$cgroup"
@@ -98,6 +110,8 @@ is() { [[ $(property "$1" 2>/dev/null) == "$2" ]]; }
 says() { [[ $(property StatusText) == *"$1"* ]]; }
 wait_for 40 'ready, shut in' is SubState running
 wait_for 20 'says so in words' says 'whiskers streaming'
+by_keys() { "${program[@]}" status --connect $tls --credentials "$work/keys/holders/alice" --json >"$work/status.json"; }
+wait_for 20 "an operator's keys are good for its, which systemd hands to it alone" by_keys
 inside sed -i 's/^source = "fused"/source = "odometry"/' /etc/robominer-slam/config.toml
 inside systemctl reload robominer-slam
 named() { inside journalctl --no-pager -p warning -u robominer-slam | grep 'estimation.source .* needs a restart' >/dev/null; }

@@ -43,7 +43,10 @@ def load_credentials(folder: Path) -> Credentials:
     """
     if not folder.is_dir():
         raise KeysError(f"{folder}: there is no such folder; expected a holder's bundle, made by: keys issue")
-    keys = sorted(folder.glob("*.key"))
+    try:
+        keys = sorted(path for path in folder.iterdir() if path.suffix == ".key")
+    except OSError as error:
+        raise KeysError(f"{folder}: cannot be read: {error.strerror}") from error
     if any(key.name == "ca.key" for key in keys):
         raise KeysError(f"{folder}: the authority's own folder; its key must stay there: expected a holder's bundle")
     if len(keys) != 1:
