@@ -30,15 +30,13 @@ from robominer_slam.slam.backend_runner import BackendRunner
 from robominer_slam.slam.composite_scan import CompositeScan
 from robominer_slam.slam.keyframe import BackendResult, Keyframe
 from robominer_slam.slam.place_prior import PlacePrior
-from robominer_slam.slam.scan_odometry import ScanOdometry
+from robominer_slam.slam.scan_odometry import ScanOdometry, with_height
 from robominer_slam.whisker_monitor import WhiskerMonitor
 
 FloatArray = NDArray[np.float64]
 
 #: Without contacts for this long there is nothing to localise on.
 BLIND_NS = 2_000_000_000
-#: How well the height is known from one match to the next.
-HEIGHT_SIGMA_M = 0.002
 #: Without odometry for this long the robot may be anywhere near: the pose is not known.
 ODOMETRY_TIMEOUT_NS = 2_000_000_000
 #: Of x, y, yaw while the place in the map is not known: 10 m, and any heading.
@@ -229,17 +227,20 @@ class Pipeline:
             return odometry
         level, tilt = geometry.levelled(planar_pose(odometry))
         points = contacts.compress(floor, axis=0).dot(tilt.T)
-        covariance = np.zeros((4, 4))
-        covariance[:3, :3] = reckoning.relative_covariance()
-        covariance[3, 3] = HEIGHT_SIGMA_M**2
-        correction = scans.match(level, covariance, points)
+        walls = contacts.compress(~floor, axis=0).dot(tilt.T)
+        correction = scans.match(level, with_height(reckoning.relative_covariance()), points)
         if correction is not None:
             reckoning.correct_pose(stamp, correction.offset, correction.information)
             odometry = self._dead_reckoning.state_at(stamp)
             level, _ = geometry.levelled(planar_pose(odometry))
+        along = scans.match_walls(level, walls)
+        if along is not None:
+            reckoning.correct_pose(stamp, along.offset, along.information)
+            odometry = self._dead_reckoning.state_at(stamp)
+            level, _ = geometry.levelled(planar_pose(odometry))
         if scans.breaks > self._breaks:
             self._broken(scans.breaks)
-        scans.add(level, points)
+        scans.add(level, points, walls)
         return odometry
 
     def _broken(self, breaks: int) -> None:

@@ -20,12 +20,12 @@ from robominer_slam.mapping.keyframe_map import KeyframeMap
 from robominer_slam.patch_pages import SqlitePages
 from robominer_slam.publishing.map_stream import MapStreamDecoder, MapStreamEncoder
 from robominer_slam.replay import prepare, replay
-from robominer_slam.slam.closure_search import Patch
 from robominer_slam.slam.covered_ground import covered_share
 from robominer_slam.slam.graph_marginals import TrackedCovariance
 from robominer_slam.slam.keyframe_graph import KeyframeGraph
 from robominer_slam.slam.keyframe_removal import mergeable, remove_keyframes
 from robominer_slam.slam.level_edges import LevelEdge
+from robominer_slam.slam.patch import Patch
 from robominer_slam.slam.patch_memory import PatchMemory
 from robominer_slam.slam.robust import RobustBackend
 
@@ -189,13 +189,15 @@ def test_ground_covers_touches_near_it_and_no_others():
 class TestPatchMemory:
     def test_paged_touches_come_back_as_they_were(self):
         rng = np.random.default_rng(1)
-        patches = {k: Patch(rng.uniform(-0.6, 0.6, (100, 3)), 0.25 * k) for k in range(50)}
+        sides = {k: rng.uniform(-0.6, 0.6, (20 * (k % 2), 3)) for k in range(50)}
+        patches = {k: Patch(rng.uniform(-0.6, 0.6, (100, 3)), 0.25 * k, walls) for k, walls in sides.items()}
         memory = PatchMemory(1000, SqlitePages())
         for k, patch in patches.items():
             memory[k] = patch
             assert memory.points_in_memory <= 1000
         for k in rng.permutation(50).tolist():
             np.testing.assert_allclose(memory[k].points, patches[k].points, atol=1e-7)
+            np.testing.assert_allclose(memory[k].walls, patches[k].walls, atol=1e-7)
             assert memory[k].travelled == patches[k].travelled
             assert memory.points_in_memory <= 1000
         assert memory.fetched >= 40

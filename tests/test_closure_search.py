@@ -7,7 +7,8 @@ import pytest
 
 from robominer_slam import geometry
 from robominer_slam.configuration.robust_slam_section import ClosureSection
-from robominer_slam.slam.closure_search import Closure, ClosureSearch, Patch
+from robominer_slam.slam.closure_search import Closure, ClosureSearch
+from robominer_slam.slam.patch import Patch
 from tests.touched_ground import MODEL, corridor, flat, repeated, rough, touches
 
 SECTION = ClosureSection()
@@ -39,7 +40,7 @@ def found(
     source[rng.random(700) < spoilt, 2] += 0.05
     covariance = np.diag(np.square(sigma))
     return ClosureSearch(ClosureSection(**section), MODEL).find(
-        source, NEW, list(PASS), patches, PASS, dz, truth + off, covariance, np.zeros((3, 3)), ANCHOR
+        Patch(source, 10.0), NEW, list(PASS), patches, PASS, dz, truth + off, covariance, np.zeros((3, 3)), ANCHOR
     )
 
 
@@ -127,7 +128,7 @@ def test_the_patchs_own_drift_adds_to_the_covariance():
     source = touches(rough(0), rng, 700, HALF)
     search, prior, drift = ClosureSearch(SECTION, MODEL), np.diag([0.01, 0.01, 0.003]), np.diag([4e-4, 1e-4, 1e-4])
     without, with_drift = (
-        search.find(source, NEW, list(PASS), patches, PASS, 0.0, np.zeros(3), prior, patch, ANCHOR)
+        search.find(Patch(source, 10.0), NEW, list(PASS), patches, PASS, 0.0, np.zeros(3), prior, patch, ANCHOR)
         for patch in (np.zeros((3, 3)), drift)
     )
     assert without is not None

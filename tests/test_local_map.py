@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from robominer_slam.slam.local_map import LocalMap
+from robominer_slam.slam.surface import Surface
 from tests.touched_ground import MODEL
 
 KEEP, AGE, CELL = 1.0, 0.1, 0.02
 
 
-def local_map(per_cell: int = 2, rebuild: float = 0.0) -> LocalMap:
-    return LocalMap(MODEL, KEEP, AGE, CELL, per_cell, rebuild)
+def local_map(per_cell: int = 2, rebuild: float = 0.0) -> LocalMap[Surface]:
+    return LocalMap(partial(Surface, model=MODEL), KEEP, AGE, CELL, per_cell, rebuild)
 
 
-def heights(ground: LocalMap) -> list[float]:
+def heights(ground: LocalMap[Surface]) -> list[float]:
     return sorted(ground.surface.points[:, 2].tolist())
 
 

@@ -59,6 +59,13 @@ class ClosureSection(Section):
         0.12, "m", "least half size: alternatives must be seen to be ruled out", low=0.01, high=5.0
     )
     max_window: float = parameter(1.2, "m", "greatest half size: bounds the time", low=0.05, high=20.0)
+    max_window_walls: float = parameter(
+        4.0,
+        "m",
+        "as max_window where there are walls: patches with walls are unlike each other, and galleries come back late",
+        low=0.05,
+        high=20.0,
+    )
     min_yaw_window_deg: float = parameter(8.0, "deg", "as min_window", low=0.5, high=180.0)
     max_yaw_window_deg: float = parameter(60.0, "deg", "as max_window", low=1.0, high=180.0)
     cell: float = parameter(0.02, "m", "of the search's grid", low=0.005, high=0.2)
@@ -74,6 +81,13 @@ class ClosureSection(Section):
         4.0, "1", "distance from the prediction in sigmas, three axes: 0.1 % by chance", low=1.0, high=100.0
     )
     max_sigma: float = parameter(0.025, "m", "a match that leaves a direction free is none", low=0.001, high=1.0)
+    max_sigma_along: float = parameter(
+        0.08,
+        "m",
+        "as max_sigma, along walls that hold all else: matches that pass the other checks are 12 mm off there",
+        low=0.001,
+        high=1.0,
+    )
     max_sigma_yaw_deg: float = parameter(2.5, "deg", "as max_sigma", low=0.1, high=45.0)
     inflation: float = parameter(
         40.0,

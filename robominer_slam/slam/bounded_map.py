@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from robominer_slam import geometry
 from robominer_slam.configuration.bounded_map_section import BoundedMapSection
 from robominer_slam.slam.closure_leverage import drop_least_needed
-from robominer_slam.slam.closure_search import Patch
 from robominer_slam.slam.composite_scan import voxel_filter
 from robominer_slam.slam.covered_ground import covered_share
 from robominer_slam.slam.keyframe import Merge
@@ -28,6 +27,7 @@ from robominer_slam.slam.keyframe_removal import (
     mergeable,
     remove_keyframes,
 )
+from robominer_slam.slam.patch import Patch
 from robominer_slam.slam.patch_memory import PatchMemory
 from robominer_slam.slam.surface_registration import placed
 
@@ -198,9 +198,11 @@ class BoundedMap:
         row = nodes.row(key)
         before = int(nodes.ids[row - 1])
         shift = np.append(self._graph.relative(before, key), nodes.heights[row] - nodes.heights[row - 1])
-        points = np.concatenate([self._patches[before].points, placed(self._patches[key].points, shift)])
-        points = voxel_filter(points, self._bounds.merge_voxel)
-        self._patches[before] = Patch(points, float(nodes.travelled[row - 1]))
+        kept, gone = self._patches[before], self._patches[key]
+        points = np.concatenate([kept.points, placed(gone.points, shift)])
+        walls = np.concatenate([kept.walls, placed(gone.walls, shift)])
+        points, walls = voxel_filter(points, self._bounds.merge_voxel), voxel_filter(walls, self._bounds.merge_voxel)
+        self._patches[before] = Patch(points, float(nodes.travelled[row - 1]), walls)
         T = geometry.T_from_xyyaw(shift[:3])
         T[2, 3] = shift[3]
         R_into, R_gone = np.eye(4), np.eye(4)

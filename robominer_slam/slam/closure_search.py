@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from robominer_slam import geometry
 from robominer_slam.configuration.robust_slam_section import ClosureSection
+from robominer_slam.slam.composite_scan import voxel_filter
 from robominer_slam.slam.correlative_search import (
     SAME_ANGLE,
     SAME_DISTANCE,
@@ -25,13 +26,18 @@ from robominer_slam.slam.correlative_search import (
     search,
     turned,
 )
+from robominer_slam.slam.patch import Patch
 from robominer_slam.slam.surface import Surface, SurfaceModel
 from robominer_slam.slam.surface_registration import YAW, SurfaceMatch, X, Y, Z, fit_each, height_left_free, placed
+from robominer_slam.slam.wall_registration import WallTouches
+from robominer_slam.slam.wall_surface import WallSurface
 
 FloatArray = NDArray[np.float64]
 
 #: Deviation of the common height in a match, m: odometry knows it better than any search must.
 HEIGHT_SIGMA = 0.01
+#: Touches of walls nearer than this are one, m: a mean knows a wall's slope better than those that scatter.
+WALL_VOXEL = 0.02
 #: Times that planes are looked up anew in the refinement.
 ASSOCIATIONS = 3
 #: Places of a search that are refined and compared.
@@ -66,19 +72,6 @@ class Closure:
     uniqueness: float
     moved: float
     good: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Patch:
-    """Touches in the level frame of the keyframe that they were gathered at.
-
-    Attributes:
-        points: shape (m, 3), m.
-        travelled: way driven up to it, m.
-    """
-
-    points: FloatArray
-    travelled: float
 
 
 class ClosureSearch:
@@ -119,7 +112,7 @@ class ClosureSearch:
 
     def find(
         self,
-        source: FloatArray,
+        source: Patch,
         new: int,
         targets: Sequence[int],
         patches: Mapping[int, Patch],
@@ -133,7 +126,7 @@ class ClosureSearch:
         """Search one pass; None if nothing overlaps enough.
 
         Args:
-            source: touches in the new keyframe's level frame, shape (m, 3), m.
+            source: touches in the new keyframe's level frame.
             new: its id.
             targets: ids of the pass.
             patches, poses: as of `passes`.
@@ -147,12 +140,13 @@ class ClosureSearch:
         places = np.zeros((len(targets), 4))
         places[:, :3] = geometry.se2_compose(geometry.se2_inverse(poses[anchor]), np.stack([poses[k] for k in targets]))
         target = np.concatenate([placed(patches[k].points, place) for k, place in zip(targets, places, strict=True)])
-        points = _thinned(source, parameters.points)
-        points = points + np.array([0.0, 0.0, dz])
+        points = _thinned(source.points, parameters.points)
+        up = np.array([0.0, 0.0, dz])
+        points = points + up
         c, s = np.cos(prediction[YAW]), np.sin(prediction[YAW])
         R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         prior = R @ covariance @ R.T
-        half = self._window(prior)
+        half = self._window(prior, len(source.walls) > 0)
         rim = float(np.hypot(points[:, 0], points[:, 1]).max())
         reach = rim + half[:2] + 3.0 * parameters.cell
         low, high = prediction[:2] - reach, prediction[:2] + reach
@@ -178,32 +172,57 @@ class ClosureSearch:
             return None
         margin = BEYOND[X] + BEYOND[YAW] * rim + self._model.reach
         ground = target[_within(target, first - margin, last + margin)]
-        match, unique = self._refined(Surface(ground, self._model), points, found.poses)
-        return self._judged(match, unique, prediction, prior, R @ patch_covariance @ R.T, half, new, anchor, dz)
+        walls = self._walls(source.walls + up, targets, places, patches, prediction[:2], half)
+        match, unique = self._refined(Surface(ground, self._model), points, found.poses, walls)
+        patch = R @ patch_covariance @ R.T
+        return self._judged(match, unique, walls is not None, prediction, prior, patch, half, new, anchor, dz)
 
-    def _refined(self, surface: Surface, points: FloatArray, places: FloatArray) -> tuple[SurfaceMatch, float]:
+    def _walls(
+        self,
+        touches: FloatArray,
+        targets: Sequence[int],
+        places: FloatArray,
+        patches: Mapping[int, Patch],
+        middle: FloatArray,
+        half: FloatArray,
+    ) -> WallTouches | None:
+        """Touches of walls (m, 3) and the pass's walls about where they may come to; None if there are none."""
+        if not len(touches):
+            return None
+        points = _thinned(touches, self._parameters.points)
+        parts = [placed(patches[k].walls, place) for k, place in zip(targets, places, strict=True)]
+        walls = voxel_filter(np.concatenate(parts), WALL_VOXEL)
+        reach = float(np.hypot(points[:, 0], points[:, 1]).max()) + half[:2] + BEYOND[X] + self._model.reach
+        walls = walls[_within(walls, middle - reach, middle + reach)]
+        return WallTouches(WallSurface(walls, self._model), points) if len(walls) else None
+
+    def _refined(
+        self, surface: Surface, points: FloatArray, places: FloatArray, walls: WallTouches | None
+    ) -> tuple[SurfaceMatch, float]:
         """The best of the places after refinement, and by how much the next best that is another costs more."""
         height_prior = np.zeros((4, 4))
         height_prior[Z, Z] = 1.0 / HEIGHT_SIGMA**2
         guesses = np.column_stack([places, np.zeros(len(places))])
-        matches = fit_each(surface, points, guesses, height_prior, ASSOCIATIONS, APART)
+        matches = fit_each(surface, points, guesses, height_prior, ASSOCIATIONS, APART, walls)
         enough = [m for m in matches if m.overlap >= self._parameters.min_overlap] or matches
         best = min(enough, key=lambda m: m.cost)
         others = [m.cost for m in enough if not _same(m.pose, best.pose)]
         return best, min(others, default=np.inf) / max(best.cost, 1e-12)
 
-    def _window(self, prior: FloatArray) -> FloatArray:
-        """Half size of the search in x, y and heading."""
+    def _window(self, prior: FloatArray, walled: bool) -> FloatArray:
+        """Half size of the search in x, y and heading; wider with touches of walls."""
         p = self._parameters
         sigma = p.sigmas * np.sqrt(np.diag(prior))
         low = np.array([p.min_window, p.min_window, np.deg2rad(p.min_yaw_window_deg)])
-        high = np.array([p.max_window, p.max_window, np.deg2rad(p.max_yaw_window_deg)])
+        widest = p.max_window_walls if walled else p.max_window
+        high = np.array([widest, widest, np.deg2rad(p.max_yaw_window_deg)])
         return np.clip(sigma, low, high)
 
     def _judged(
         self,
         match: SurfaceMatch,
         unique: float,
+        walled: bool,
         prediction: FloatArray,
         prior: FloatArray,
         patch: FloatArray,
@@ -221,6 +240,7 @@ class ClosureSearch:
         off = match.pose[:3] - prediction
         off[YAW] = geometry.wrap_angle(off[YAW])
         moved = float(np.sqrt(off @ np.linalg.solve(prior + covariance, off)))
+        across, along = np.linalg.eigvalsh(covariance[:2, :2]).tolist()
         good = (
             match.overlap >= p.min_overlap
             and match.inliers >= p.min_inliers
@@ -228,7 +248,8 @@ class ClosureSearch:
             and unique >= p.uniqueness
             and moved <= p.max_moved
             and least > 0.0
-            and float(np.linalg.eigvalsh(covariance[:2, :2])[-1]) <= p.max_sigma**2
+            and across <= p.max_sigma**2
+            and along <= max(p.max_sigma, p.max_sigma_along if walled else p.max_sigma) ** 2
             and covariance[YAW, YAW] <= np.deg2rad(p.max_sigma_yaw_deg) ** 2
             and bool((np.abs(off) <= half + BEYOND).all())
         )

@@ -48,6 +48,11 @@ class Keyframe:
         """The points of whiskers that point down: heights over the plane are the floor's, walls have none."""
         return self.points if self.floor is None else self.points[self.floor]
 
+    @property
+    def wall_points(self) -> FloatArray:
+        """Touches of the whiskers that do not, shape (m, 3), m."""
+        return self.points[:0] if self.floor is None else self.points[~self.floor]
+
 
 @dataclass(frozen=True, slots=True)
 class GraphEdge:

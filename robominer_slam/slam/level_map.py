@@ -12,11 +12,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from robominer_slam import geometry
-from robominer_slam.slam.closure_search import Patch
-from robominer_slam.slam.composite_scan import voxel_filter
 from robominer_slam.slam.keyframe import GraphEdge
 from robominer_slam.slam.keyframe_nodes import KeyframeNodes
 from robominer_slam.slam.level_edges import LevelEdge
+from robominer_slam.slam.patch import Patch, patch_of
 from robominer_slam.slam.published_edges import PLANAR
 from robominer_slam.slam.saved_map import SavedMap
 from robominer_slam.slam.surface_registration import placed
@@ -93,7 +92,7 @@ def from_saved(saved: SavedMap, voxel: float) -> LevelMap:
         known.poses[k], known.heights[k], known.tilts[k] = level[:3], float(level[3]), tilt
         known.travelled[k] = keyframe.travelled
         if len(keyframe.points):
-            known.patches[k] = Patch(voxel_filter(keyframe.floor_points @ tilt.T, voxel), keyframe.travelled)
+            known.patches[k] = patch_of(keyframe, tilt, voxel)
     known.edges = [_levelled_edge(edge, known) for edge in saved.edges]
     known.edges += _chain(known)
     return known

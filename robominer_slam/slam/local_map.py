@@ -11,10 +11,11 @@ Source: the voxel map of KISS-ICP (Vizzo et al., RA-L 2023) keeps its first poin
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
-
-from robominer_slam.slam.surface import Surface, SurfaceModel
 
 FloatArray = NDArray[np.float64]
 
@@ -22,11 +23,15 @@ FloatArray = NDArray[np.float64]
 KEY_STRIDE = 1 << 24
 
 
-class LocalMap:
+#: What touches make up: the floor's surface, or that of walls.
+SurfaceT = TypeVar("SurfaceT")
+
+
+class LocalMap(Generic[SurfaceT]):
     """Touches of the last metres.
 
     Args:
-        model: how touches make a surface.
+        surface_of: what touches of shape (n, 3), m, make up.
         keep: travel after which a touch leaves, m.
         age: travel before a touch becomes a target, m.
         cell: size of a cell, m.
@@ -41,9 +46,15 @@ class LocalMap:
     _built: float
 
     def __init__(
-        self, model: SurfaceModel, keep: float, age: float, cell: float, per_cell: int, rebuild: float
+        self,
+        surface_of: Callable[[FloatArray], SurfaceT],
+        keep: float,
+        age: float,
+        cell: float,
+        per_cell: int,
+        rebuild: float,
     ) -> None:
-        self._model = model
+        self._surface_of = surface_of
         self._keep, self._age = keep, age
         self._cell, self._per_cell, self._rebuild = cell, per_cell, rebuild
         self._waiting: list[tuple[float, FloatArray]] = []
@@ -80,7 +91,7 @@ class LocalMap:
         (low_x, low_y), (high_x, high_y) = (centre - radius).tolist(), (centre + radius).tolist()
         x, y, _ = self._points
         (near,) = ((x >= low_x) & (x <= high_x) & (y >= low_y) & (y <= high_y)).nonzero()
-        self.surface = Surface(np.ascontiguousarray(self._points.take(near, axis=1).T), self._model)
+        self.surface = self._surface_of(np.ascontiguousarray(self._points.take(near, axis=1).T))
 
     def clear(self) -> None:
         """Forget everything: after a jump of odom the old touches are elsewhere."""
@@ -88,7 +99,7 @@ class LocalMap:
         self._taken: dict[int, int] = {}
         self._waiting = []
         self._built = -np.inf
-        self.surface = Surface(np.zeros((0, 3)), self._model)
+        self.surface = self._surface_of(np.zeros((0, 3)))
 
     def _cells_of(self, points: FloatArray) -> NDArray[np.int64]:
         ij = np.floor(points[:, :2] / self._cell).astype(np.int64)

@@ -8,14 +8,18 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robominer_slam.slam.closure_search import Patch
+from robominer_slam.slam.patch import Patch, no_touches
 
 FloatArray = NDArray[np.float64]
+
+
+#: A patch in memory: touches of the floor, way driven, touches of walls.
+Kept: TypeAlias = tuple[NDArray[np.float32], float, NDArray[np.float32]]
 
 
 class PatchPages(Protocol):
@@ -51,9 +55,10 @@ class PatchMemory(Mapping[int, Patch]):
         self._max_points = max_points
         self._pages = pages
         #: As float32, which is exact to 0.1 micrometres: half of the memory. Copies, without what views hold on to.
-        self._here: OrderedDict[int, tuple[NDArray[np.float32], float]] = OrderedDict()
+        self._here: OrderedDict[int, Kept] = OrderedDict()
         self._away: dict[int, float] = {}
         self._written: set[int] = set()
+        self._walled: set[int] = set()
         self.points_in_memory = 0
         self.fetched = 0
         self.fault = ""
@@ -65,9 +70,10 @@ class PatchMemory(Mapping[int, Patch]):
     def __getitem__(self, key: int) -> Patch:
         if key in self._here:
             self._here.move_to_end(key)
-            points, travelled = self._here[key]
-            return Patch(points.astype(np.float64), travelled)
-        patch = Patch(self._read(key), self._away.pop(key))
+            points, travelled, walls = self._here[key]
+            return Patch(points.astype(np.float64), travelled, walls.astype(np.float64))
+        floor, beside = self._read(key)
+        patch = Patch(floor, self._away.pop(key), beside)
         self._take_in(key, patch)
         return patch
 
@@ -83,20 +89,19 @@ class PatchMemory(Mapping[int, Patch]):
     def pop(self, key: int) -> None:
         """Let go of a patch, if there is one."""
         if key in self._here:
-            points, _ = self._here.pop(key)
-            self.points_in_memory -= len(points)
+            self.points_in_memory -= _touches(self._here.pop(key))
         self._away.pop(key, None)
         if key in self._written:
             self._written.discard(key)
             self._delete(key)
 
     def _take_in(self, key: int, patch: Patch) -> None:
-        self._here[key] = patch.points.astype(np.float32), patch.travelled
-        self.points_in_memory += len(patch.points)
+        self._here[key] = patch.points.astype(np.float32), patch.travelled, patch.walls.astype(np.float32)
+        self.points_in_memory += len(patch)
         while self.points_in_memory > self._max_points and len(self._here) > 1 and self._write(next(iter(self._here))):
-            oldest, (points, travelled) = self._here.popitem(last=False)
-            self.points_in_memory -= len(points)
-            self._away[oldest] = travelled
+            oldest, gone = self._here.popitem(last=False)
+            self.points_in_memory -= _touches(gone)
+            self._away[oldest] = gone[1]
 
     def _write(self, key: int) -> bool:
         """Whether a patch is in the pages."""
@@ -105,26 +110,39 @@ class PatchMemory(Mapping[int, Patch]):
         if self._pages is None or self.fault:
             return False
         try:
-            self._pages.write(key, self._here[key][0])
+            points, _, walls = self._here[key]
+            self._pages.write(key, points)
+            if len(walls):
+                # Under a key that no keyframe has.
+                self._pages.write(~key, walls)
+                self._walled.add(key)
         except OSError as error:
             self.fault = str(error)
             return False
         self._written.add(key)
         return True
 
-    def _read(self, key: int) -> FloatArray:
-        """Touches that are away; none where they cannot be read: ground that is not known is not matched with."""
+    def _read(self, key: int) -> tuple[FloatArray, FloatArray]:
+        """Touches of floor and walls that are away; none where they cannot be read: unknown ground is not matched."""
         assert self._pages is not None
         self.fetched += 1
         try:
-            return self._pages.read(key)
+            return self._pages.read(key), self._pages.read(~key) if key in self._walled else no_touches()
         except OSError as error:
             self.fault = str(error)
-            return np.zeros((0, 3))
+            return no_touches(), no_touches()
 
     def _delete(self, key: int) -> None:
         assert self._pages is not None
         try:
             self._pages.delete(key)
+            if key in self._walled:
+                self._walled.discard(key)
+                self._pages.delete(~key)
         except OSError as error:
             self.fault = str(error)
+
+
+def _touches(kept: Kept) -> int:
+    points, _, walls = kept
+    return len(points) + len(walls)

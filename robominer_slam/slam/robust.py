@@ -19,12 +19,12 @@ from robominer_slam.slam.bias_walk import BiasWalk
 from robominer_slam.slam.bounded_map import BoundedMap
 from robominer_slam.slam.closure_agreement import agreeing
 from robominer_slam.slam.closure_counters import ClosureCounters
-from robominer_slam.slam.closure_search import Closure, ClosureSearch, Patch
-from robominer_slam.slam.composite_scan import voxel_filter
+from robominer_slam.slam.closure_search import Closure, ClosureSearch
 from robominer_slam.slam.graph_marginals import TrackedCovariance
 from robominer_slam.slam.keyframe import BackendResult, Keyframe
 from robominer_slam.slam.keyframe_edges import loop_edge, motion_of, odometry_edge, symmetric_inverse
 from robominer_slam.slam.keyframe_graph import KeyframeGraph
+from robominer_slam.slam.patch import Patch, patch_of
 from robominer_slam.slam.patch_memory import PatchMemory, PatchPages
 from robominer_slam.slam.published_edges import PublishedEdges
 from robominer_slam.slam.surface import SurfaceModel
@@ -91,9 +91,8 @@ class RobustBackend:
 
     def _add_node(self, keyframe: Keyframe) -> None:
         level, tilt = geometry.levelled(keyframe.T_odom_base)
-        points = voxel_filter(keyframe.floor_points @ tilt.T, self._parameters.point_voxel)
         k = keyframe.id
-        self._patches[k] = Patch(points, keyframe.travelled)
+        self._patches[k] = patch_of(keyframe, tilt, self._parameters.point_voxel)
         graph = self._graph
         if self._last is None:
             graph.nodes.append(k, level[:3], float(level[3]), tilt, keyframe.travelled)
@@ -117,9 +116,9 @@ class RobustBackend:
         graph.nodes.append(k, pose, graph.nodes.height(self._last.id) + edge.dz, tilt, keyframe.travelled)
         self._tracked.follow(edge, graph.bias, walk)
 
-    def _source(self, keyframe: Keyframe) -> tuple[FloatArray, int]:
+    def _source(self, keyframe: Keyframe) -> tuple[Patch, int]:
         """Touches of the last keyframes, in the level frame of the newest, and the id of the oldest."""
-        parts, oldest = [], keyframe.id
+        parts, walls, oldest = [], [], keyframe.id
         for k in range(keyframe.id, -1, -1):
             patch = self._patches.get(k)
             if patch is None or keyframe.travelled - patch.travelled >= self._parameters.closure.patch:
@@ -127,8 +126,9 @@ class RobustBackend:
             pose = self._graph.relative(keyframe.id, k)
             dz = self._graph.nodes.height(k) - self._graph.nodes.height(keyframe.id)
             parts.append(placed(patch.points, np.append(pose, dz)))
+            walls.append(placed(patch.walls, np.append(pose, dz)))
             oldest = k
-        return np.concatenate(parts), oldest
+        return Patch(np.concatenate(parts), keyframe.travelled, np.concatenate(walls)), oldest
 
     # --------------------------------------------------------------------------------------------- closures
 
@@ -153,7 +153,7 @@ class RobustBackend:
         """Closures of a keyframe that pass every check of their own."""
         self._searched = keyframe.id
         source, oldest = self._source(keyframe)
-        if len(source) < LEAST_POINTS:
+        if len(source.points) < LEAST_POINTS:
             return []
         k, graph, nodes = keyframe.id, self._graph, self._graph.nodes
         sigma = float(np.sqrt(np.linalg.eigvalsh(self._predicted_covariance()[:2, :2])[-1]))

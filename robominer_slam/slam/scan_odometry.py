@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import TypeAlias
 
 import numpy as np
@@ -16,8 +17,10 @@ from numpy.typing import NDArray
 
 from robominer_slam.configuration.robust_slam_section import ScanMatchingSection
 from robominer_slam.slam.local_map import LocalMap
-from robominer_slam.slam.surface import SurfaceModel
-from robominer_slam.slam.surface_registration import YAW, SurfaceMatch, Z, fit, height_left_free, placed
+from robominer_slam.slam.surface import Surface, SurfaceModel
+from robominer_slam.slam.surface_registration import LEAST_KNOWN, YAW, SurfaceMatch, Z, fit, height_left_free, placed
+from robominer_slam.slam.wall_odometry import way_along
+from robominer_slam.slam.wall_surface import WallSurface
 
 FloatArray = NDArray[np.float64]
 #: x, y (m), yaw (rad) in odom.
@@ -25,6 +28,8 @@ Pose: TypeAlias = tuple[float, float, float]
 
 #: Fewer contacts are not worth a match.
 LEAST_CONTACTS = 8
+#: How well the height is known from one match to the next, m.
+HEIGHT_SIGMA = 0.002
 #: Turning by 1 rad moves the whiskers by about this, m: travel counts both.
 TURN_ARM = 0.15
 #: Of the best known direction's information: a direction with less has none.
@@ -32,6 +37,7 @@ LEAST_SHARE = 1e-9
 #: Of the apparent information along a direction, less than this is no more than errors of the slopes.
 LEAST_VARIATION = 0.25
 EYE = np.eye(3)
+NOTHING = np.zeros((0, 3))
 #: So many matches in a row in which less than this share fits, each over ground known to the other share, are a
 #: break: on the thesis's ground the best of five never had less than 0.74, after being carried 0.3 to 0.66.
 BREAK_MISFITS = 5
@@ -56,7 +62,7 @@ class ScanOdometry:
     """Matches the frames of a drive with the local map.
 
     Attributes:
-        matches: made so far.
+        matches, wall_matches: made so far, with floor and walls.
         travelled: way of the array, m.
         breaks: how often the ground ceased to be the one touched just before; the local map begins anew then.
     """
@@ -71,12 +77,12 @@ class ScanOdometry:
         """
         self._parameters = parameters
         self._reach = reach
-        self._map = LocalMap(
-            model, parameters.keep, parameters.age, parameters.cell, parameters.per_cell, parameters.rebuild
-        )
+        kept = parameters.keep, parameters.age, parameters.cell, parameters.per_cell, parameters.rebuild
+        self._map = LocalMap(partial(Surface, model=model), *kept)
+        self._walls = LocalMap(partial(WallSurface, model=model), *kept)
         self._last: Pose | None = None
         self._before: Pose | None = None
-        self.matches = 0
+        self.matches = self.wall_matches = 0
         self.travelled = 0.0
         self.breaks = 0
         self._misfits = 0
@@ -124,7 +130,26 @@ class ScanOdometry:
         reduced = gradient[:3] - H[:3, Z] * gradient[Z] / max(H[Z, Z], 1e-12)
         return ScanCorrection(_least(known, -varies.dot(reduced)), information)
 
-    def add(self, pose: FloatArray, points: FloatArray) -> None:
+    def match_walls(self, pose: FloatArray, walls: FloatArray) -> ScanCorrection | None:
+        """Match a frame's contacts with walls, at a pose that the robot has `moved` to.
+
+        Args:
+            pose: as of `match`.
+            walls: contacts of whiskers that do not point down in base_link, levelled, shape (m, 3), m.
+        """
+        if len(walls) <= LEAST_KNOWN:
+            return None
+        self._walls.update(self.travelled, pose[:2], self._reach)
+        found = way_along(self._walls.surface, walls, pose) if len(self._walls.surface) else None
+        if found is None or found.known < LEAST_VARIATION * found.apparent:
+            return None
+        self.wall_matches += 1
+        information = np.zeros((3, 3))
+        along = found.direction
+        information[:2, :2] = along[:, None] * along * (found.known**2 / found.apparent * self._parameters.share)
+        return ScanCorrection(np.append(along * found.offset, 0.0), information)
+
+    def add(self, pose: FloatArray, points: FloatArray, walls: FloatArray = NOTHING) -> None:
         """Put a frame's contacts (in base_link, levelled) into the map at its corrected pose (x, y, yaw, z)."""
         x, y, yaw, _ = pose.tolist()
         if not self._due((x, y, yaw)):
@@ -132,10 +157,13 @@ class ScanOdometry:
         self._last = x, y, yaw
         if len(points):
             self._map.add(self.travelled, placed(points, pose))
+        if len(walls):
+            self._walls.add(self.travelled, placed(walls, pose))
 
     def clear(self) -> None:
         """Forget the ground touched lately: the robot has been carried."""
         self._map.clear()
+        self._walls.clear()
         self._last = self._before = None
         self._misfits = 0
 
@@ -153,6 +181,14 @@ class ScanOdometry:
 
     def _due(self, pose: Pose) -> bool:
         return self._last is None or _way(self._last, pose) >= self._parameters.step
+
+
+def with_height(covariance: FloatArray) -> FloatArray:
+    """Covariance of (x, y, yaw), shape (3, 3), with that of the height beside it, shape (4, 4)."""
+    whole = np.zeros((4, 4))
+    whole[:3, :3] = covariance
+    whole[3, 3] = HEIGHT_SIGMA**2
+    return whole
 
 
 def _way(a: Pose, b: Pose) -> float:

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robominer_slam import geometry
-from robominer_slam.slam.closure_search import Closure, Patch
+from robominer_slam.slam.closure_search import Closure
 from robominer_slam.slam.keyframe import BackendResult, Keyframe
 from robominer_slam.slam.keyframe_edges import loop_edge
 from robominer_slam.slam.level_edges import LevelEdge
 from robominer_slam.slam.level_map import LevelMap
+from robominer_slam.slam.patch import Patch
 from robominer_slam.slam.robust import RobustBackend
 from robominer_slam.slam.surface import Surface, SurfaceModel
 from robominer_slam.slam.surface_registration import SurfaceMatch, fit, placed
@@ -72,7 +73,7 @@ class SessionBackend(RobustBackend):
         shift = begin - FAR - max(known.travelled.values(), default=0.0)
         nodes.put_before(known.nodes(shift))
         for k, patch in known.patches.items():
-            self._patches[k] = Patch(patch.points, patch.travelled + shift)
+            self._patches[k] = Patch(patch.points, patch.travelled + shift, patch.walls)
         nb = graph.bias.size
         for edge in known.edges:
             graph.edges.append(_with_biases(edge, nb))

@@ -130,38 +130,50 @@ class Surface:
         # Neighbours along the first axis: sums over them then run along whole rows of places. Those missing are
         # infinitely far and weigh nothing.
         squared = np.ascontiguousarray(np.transpose(distance)) ** 2
-        count = (squared < np.inf).sum(axis=0, dtype=np.int8)
-        weight = 1.0 / (model.touch_sigma**2 + np.square(model.curvature * squared))
         offset = np.ascontiguousarray(self._rows.take(np.transpose(index), axis=0).transpose(2, 0, 1))
-        # Heights are taken relative to the nearest touch: the regression's numbers stay small.
-        datum = offset[2, 0].copy()
         offset[:2] -= xy.T[:, None]
-        offset[2] -= datum
-        weighted = offset * weight
-        # The normal equations' matrix and its right side, of height and slopes along x and y.
-        M, right_side = np.empty((6, m)), np.empty((3, m))
-        weight.sum(axis=0, out=M[0])
-        weighted[:2].sum(axis=1, out=M[1:3])
-        weighted[2].sum(axis=0, out=right_side[0])
-        M[3], M[4], right_side[1] = np.einsum("km,akm->am", weighted[0], offset)
-        M[5], right_side[2] = np.einsum("km,akm->am", weighted[1], offset[1:])
-        zz = np.einsum("km,km->m", weighted[2], offset[2])
-        prior_of = np.array([[1e-6 / model.touch_sigma**2], [prior], [prior]])
-        M[DIAGONAL] += prior_of
-        # Its inverse by cofactors.
-        inverse = M.take(FIRST, axis=0) * M.take(SECOND, axis=0)
-        inverse -= M.take(THIRD, axis=0) * M.take(FOURTH, axis=0)
-        inverse /= np.einsum("am,am->m", M[:3], inverse[:3])
-        plane = np.einsum("abm,bm->am", inverse.take(WHOLE, axis=0), right_side)
-        # What the plane f leaves of the weighted squares: z'Wz - f'X'Wz, without what the prior pulls f by.
-        chi2 = zz - np.einsum("am,am->m", plane, right_side + prior_of * plane)
-        np.maximum(chi2, 0.0, out=chi2)
-        height, slope, slope_covariance = plane[0], np.ascontiguousarray(plane[1:].T), inverse[3:]
-        known = count >= LEAST_NEIGHBOURS
-        # A step must show here, four touches that are off their plane by chance must not: the mean over the touches.
-        steps = np.maximum(chi2 / np.maximum(count - 1, 1), 1.0)
-        variance = inverse[0] * steps + model.touch_sigma**2
-        misfit = chi2 / np.maximum(count - UNKNOWNS, 1)
-        return SurfacePatches(
-            known, np.where(known, datum + height, 0.0), slope, variance, slope_covariance, misfit, prior
-        )
+        return planes_through(offset, squared, model)
+
+
+def planes_through(offset: FloatArray, squared: FloatArray, model: SurfaceModel) -> SurfacePatches:
+    """Planes through the touches around m places.
+
+    Args:
+        offset: along both axes of the surface from a place to its k nearest touches, nearest first, and their
+            heights, shape (3, k, m), m; is used up.
+        squared: of their distances along the surface, shape (k, m), m2; infinite for those that are missing.
+        model: how touches make a surface.
+    """
+    m = squared.shape[1]
+    prior = 1.0 / model.slope_sigma**2
+    count = (squared < np.inf).sum(axis=0, dtype=np.int8)
+    weight = 1.0 / (model.touch_sigma**2 + np.square(model.curvature * squared))
+    # Heights are taken relative to the nearest touch: the regression's numbers stay small.
+    datum = offset[2, 0].copy()
+    offset[2] -= datum
+    weighted = offset * weight
+    # The normal equations' matrix and its right side, of height and slopes along x and y.
+    M, right_side = np.empty((6, m)), np.empty((3, m))
+    weight.sum(axis=0, out=M[0])
+    weighted[:2].sum(axis=1, out=M[1:3])
+    weighted[2].sum(axis=0, out=right_side[0])
+    M[3], M[4], right_side[1] = np.einsum("km,akm->am", weighted[0], offset)
+    M[5], right_side[2] = np.einsum("km,akm->am", weighted[1], offset[1:])
+    zz = np.einsum("km,km->m", weighted[2], offset[2])
+    prior_of = np.array([[1e-6 / model.touch_sigma**2], [prior], [prior]])
+    M[DIAGONAL] += prior_of
+    # Its inverse by cofactors.
+    inverse = M.take(FIRST, axis=0) * M.take(SECOND, axis=0)
+    inverse -= M.take(THIRD, axis=0) * M.take(FOURTH, axis=0)
+    inverse /= np.einsum("am,am->m", M[:3], inverse[:3])
+    plane = np.einsum("abm,bm->am", inverse.take(WHOLE, axis=0), right_side)
+    # What the plane f leaves of the weighted squares: z'Wz - f'X'Wz, without what the prior pulls f by.
+    chi2 = zz - np.einsum("am,am->m", plane, right_side + prior_of * plane)
+    np.maximum(chi2, 0.0, out=chi2)
+    height, slope, slope_covariance = plane[0], np.ascontiguousarray(plane[1:].T), inverse[3:]
+    known = count >= LEAST_NEIGHBOURS
+    # A step must show here, four touches that are off their plane by chance must not: the mean over the touches.
+    steps = np.maximum(chi2 / np.maximum(count - 1, 1), 1.0)
+    variance = inverse[0] * steps + model.touch_sigma**2
+    misfit = chi2 / np.maximum(count - UNKNOWNS, 1)
+    return SurfacePatches(known, np.where(known, datum + height, 0.0), slope, variance, slope_covariance, misfit, prior)

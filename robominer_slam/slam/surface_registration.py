@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 
 from robominer_slam.float_array import of_floats
 from robominer_slam.geometry import wrap_angle
+from robominer_slam.slam.slope_noise import less, slope_noise_information, turned_slope_noise
 from robominer_slam.slam.surface import Surface
+from robominer_slam.slam.wall_registration import WallTouches, wall_terms
 
 FloatArray = NDArray[np.float64]
 
@@ -29,10 +31,6 @@ X, Y, YAW, Z = range(4)
 REWEIGHTINGS = 3
 #: Width of the Cauchy kernel, in sigmas.
 KERNEL_WIDTH = 2.5
-#: What noise adds to the information varies about its mean, the more the fewer touches carry it: half as much again.
-NOISE_MARGIN = 1.5
-#: Deviation of headings within a surface, rad.
-TURN_SIGMA = 0.03
 #: Of the touches, every so manieth shows which guesses are on the way to the same place.
 COARSE = 2
 #: Touches on known ground that a match takes at least: as many as it has unknowns.
@@ -111,6 +109,7 @@ def fit(
     guess: FloatArray,
     prior_information: FloatArray,
     associations: int = 2,
+    walls: WallTouches | None = None,
 ) -> SurfaceMatch:
     """Fit touches onto a surface.
 
@@ -121,8 +120,9 @@ def fit(
         prior_information: of the prior, shape (4, 4); zeros for none, but then the touches must constrain the pose
             or the step is only as long as they say.
         associations: how often planes are looked up; once suffices where the guess is good to millimetres.
+        walls: touches of walls in the same frame, and the walls that they are fitted onto.
     """
-    return fit_each(surface, points, guess[None], prior_information, associations)[0]
+    return fit_each(surface, points, guess[None], prior_information, associations, walls=walls)[0]
 
 
 def fit_each(
@@ -132,6 +132,7 @@ def fit_each(
     prior_information: FloatArray,
     associations: int = 2,
     apart: tuple[float, float] | None = None,
+    walls: WallTouches | None = None,
 ) -> list[SurfaceMatch]:
     """As `fit`, from each of several guesses, shape (k, 4): together they cost less than one after the other.
 
@@ -142,23 +143,33 @@ def fit_each(
         apart: guesses that come as near to one of less cost, m and rad, are on the way to the same place: they are
             not followed, and have no match, unless one of all gets lost. Up to the last look at the planes half of
             the touches will do. None follows all of them, with all touches.
+        walls: as of `fit`.
     """
     poses = guesses.copy()
     regular = prior_information + np.eye(4) * 1e-9
     pull = np.zeros((len(poses), 4, 1))
     for again in range(associations):
         last = again == associations - 1
-        some = points if apart is None or last else points[::COARSE]
+        every = 1 if apart is None or last else COARSE
+        some = points[::every]
+        # Columns of touches: the floor's, then the walls'.
+        floor = len(some)
+        some = some if walls is None else np.concatenate([some, walls.points[::every]])
         q = np.empty((len(poses), *some.shape))
         for k, pose in enumerate(poses):
             q[k] = placed(some, pose)
-        patches = surface.at(q.reshape(-1, 3)[:, :2])
-        known = patches.known.reshape(len(poses), -1)
+        on_floor = q[:, :floor]
+        patches = surface.at(on_floor.reshape(-1, 3)[:, :2])
+        known, variance = patches.known.reshape(len(poses), -1), patches.variance.reshape(len(poses), -1)
+        r = np.where(known, on_floor[:, :, 2] - patches.height.reshape(known.shape), 0.0)
+        J = residual_jacobian(on_floor, poses, patches.slope.reshape(*known.shape, 2))
+        if walls is not None:
+            terms = wall_terms(walls.surface, q[:, floor:], poses)
+            known, variance = np.hstack([known, terms.known]), np.hstack([variance, terms.variance])
+            r, J = np.hstack([r, terms.residual]), np.concatenate([J, terms.jacobian], axis=2)
         if min(map(np.count_nonzero, known)) < LEAST_KNOWN:
-            return _without_lost(surface, points, guesses, prior_information, associations, poses, known)
-        r = np.where(known, q[:, :, 2] - patches.height.reshape(known.shape), 0.0)
-        J = residual_jacobian(q, poses, patches.slope.reshape(*known.shape, 2))
-        inverse_variance = known / patches.variance.reshape(known.shape)
+            return _without_lost(surface, points, guesses, prior_information, associations, walls, poses, known)
+        inverse_variance = known / variance
         by_kernel = inverse_variance / KERNEL_WIDTH**2
         if again:
             offset = poses - guesses
@@ -175,14 +186,19 @@ def fit_each(
         gradient = (JtW @ e[:, :, None])[:, :, 0]
         poses = poses + step
         if apart is not None and len(poses) > 1 and not last:
-            squared, limit = np.square(e), INLIER_SIGMAS**2 * patches.variance.reshape(known.shape)
+            squared, limit = np.square(e), INLIER_SIGMAS**2 * variance
             costs = (np.minimum(squared, limit) * known).sum(axis=1) / known.sum(axis=1)
             followed = _distinct(poses, costs, *apart)
             poses, guesses, pull = poses[followed], guesses[followed], pull[followed]
     slope_noise = patches.slope_noise + turned_slope_noise(patches.slope)
-    noise = slope_noise_information(q, poses, slope_noise.reshape(3, *known.shape), weight)
-    information = _less(H, noise)
-    variance, height = patches.variance.reshape(known.shape), patches.height.reshape(known.shape)
+    height = patches.height.reshape(len(poses), -1)
+    noise = slope_noise_information(on_floor, poses, slope_noise.reshape(3, *height.shape), weight[:, :floor])
+    if walls is None:
+        information = less(H, noise)
+    else:
+        # Each on its own: a floor whose slopes are all errors must not take away what walls know.
+        by_walls = JtW[:, :, floor:] @ J[:, :, floor:].transpose(0, 2, 1)
+        information = less(H - by_walls, noise) + less(by_walls, terms.noise_information(weight[:, floor:]))
     return [
         _judged(poses[k], (information[k], H[k]), gradient[k], known[k], variance[k], height[k], q[k], e[k])
         for k in range(len(poses))
@@ -195,13 +211,15 @@ def _without_lost(
     guesses: FloatArray,
     prior_information: FloatArray,
     associations: int,
+    walls: WallTouches | None,
     poses: FloatArray,
     known: NDArray[np.bool_],
 ) -> list[SurfaceMatch]:
     """Matches of guesses of which some, at `poses` by now, have left the known ground: the others go on alone."""
     lost = known.sum(axis=1) < LEAST_KNOWN
     nothing = np.zeros((4, 4)), np.zeros((4, 4)), np.zeros(4)
-    left = iter(fit_each(surface, points, guesses[~lost], prior_information, associations) if not lost.all() else ())
+    on = guesses[~lost]
+    left = iter(fit_each(surface, points, on, prior_information, associations, None, walls) if len(on) else ())
     return [
         SurfaceMatch(pose, *nothing, float(on.mean()), 0.0, 0.0, np.inf, np.zeros((0, 3))) if gone else next(left)
         for pose, on, gone in zip(poses, known, lost, strict=True)
@@ -226,54 +244,6 @@ def height_left_free(H: FloatArray) -> FloatArray:
     return planar
 
 
-def turned_slope_noise(slope: FloatArray) -> FloatArray:
-    """Covariance of slopes (m, 2) by headings that were a little off when the surface was touched.
-
-    A ridge that was mapped slightly turned has a slope along itself, and would tell a place along it.
-
-    Returns:
-        Its xx, xy and yy, shape (3, m).
-    """
-    off = slope.T * TURN_SIGMA
-    noise = np.empty((3, len(slope)))
-    np.multiply(off[1], off[1], out=noise[0])
-    np.multiply(off[0], -off[1], out=noise[1])
-    np.multiply(off[0], off[0], out=noise[2])
-    return noise
-
-
-def slope_noise_information(q: FloatArray, pose: FloatArray, slope_noise: FloatArray, weight: FloatArray) -> FloatArray:
-    """What errors of the slopes add to J' W J in the mean, shape (..., 4, 4).
-
-    Args:
-        q: touches on the surface, shape (..., m, 3), m.
-        pose: of their frame, shape (..., 4).
-        slope_noise: covariance of the slopes there, its xx, xy and yy, shape (3, ..., m).
-        weight: of the touches, shape (..., m).
-    """
-    # J' = M' slope, with M' the rows (-1, 0), (0, -1), (a, b): the sum of w M' C M, entry by entry.
-    a, b = q[..., 1] - pose[..., Y, None], pose[..., X, None] - q[..., 0]
-    xx, xy, yy = slope_noise
-    entries = np.empty((*weight.shape[:-1], 6, weight.shape[-1]))
-    entries[..., 0, :], entries[..., 1, :], entries[..., 2, :] = xx, xy, yy
-    on_a, on_b = xx * a + xy * b, xy * a + yy * b
-    np.negative(on_a, out=entries[..., 3, :])
-    np.negative(on_b, out=entries[..., 4, :])
-    entries[..., 5, :] = a * on_a + b * on_b
-    sums = (entries @ weight[..., None])[..., 0]
-    added = np.zeros((*pose.shape, 4))
-    added[..., :3, :3] = sums[..., [[0, 1, 3], [1, 2, 4], [3, 4, 5]]]
-    return added
-
-
-def _less(H: FloatArray, noise: FloatArray) -> FloatArray:
-    """H (k, 4, 4) without what noise adds, and somewhat more, as that is a mean; kept positive semidefinite."""
-    values, vectors = np.linalg.eigh(H)
-    kept = (vectors * (noise @ vectors)).sum(axis=-2)
-    share = np.minimum(np.maximum(1.0 - NOISE_MARGIN * kept / np.maximum(values, 1e-12), 0.0), 1.0)
-    return np.asarray((vectors * (values * share)[:, None]) @ vectors.transpose(0, 2, 1))
-
-
 def _judged(
     pose: FloatArray,
     H: tuple[FloatArray, FloatArray],
@@ -290,6 +260,7 @@ def _judged(
     count = int(np.count_nonzero(fits))
     cost = float(np.minimum(squared, limit).sum()) / len(on)
     rms = math.sqrt(float(squared @ fits) / count) if count else 0.0
-    heights = np.empty((len(on), 3))
-    heights[:, :2], heights[:, 2] = q[on, :2], height[on]
+    on_floor = on[: int(np.searchsorted(on, len(height)))]
+    heights = np.empty((len(on_floor), 3))
+    heights[:, :2], heights[:, 2] = q[on_floor, :2], height[on_floor]
     return SurfaceMatch(pose, *H, gradient, len(on) / len(known), count / len(on), rms, cost, heights)
