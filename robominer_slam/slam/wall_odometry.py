@@ -1,9 +1,9 @@
 """How far the robot has come along its walls: the roughness that side whiskers feel, matched with that felt before.
 
 Walls hold the place across and the heading far better than along. But there they tell more than they know: a row of
-whiskers each 0.3 mm off is an arc, and would turn a straight gallery by half a degree a metre, where gyro and screws
-are ten times better. So place across and heading are unknowns of the match that nobody else hears of; what counts is
-the one direction that walls hold least, and of it what errors of the slopes leave.
+whiskers each 0.35 mm off is an arc, and would turn a straight gallery by half a degree a metre. So place across and
+heading are unknowns of the match that nobody else hears of; what counts is the one direction that walls hold least, and
+of it what errors of the slopes leave.
 """
 
 from __future__ import annotations
