@@ -84,8 +84,8 @@ class ClosureSection(Section):
     max_sigma_along: float = parameter(
         0.08,
         "m",
-        "as max_sigma, along walls that hold all else: such matches are 12 mm off in the median; with a limit of "
-        "0.2, 3 of 143 were off by 0.1",
+        "as max_sigma, along walls that hold all else: such matches are 12 mm off in the median, and 3 of 147 by "
+        "more than 0.1",
         low=0.001,
         high=1.0,
     )
