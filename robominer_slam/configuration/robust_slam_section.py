@@ -82,10 +82,9 @@ class ClosureSection(Section):
     )
     max_sigma: float = parameter(0.025, "m", "a match that leaves a direction free is none", low=0.001, high=1.0)
     max_sigma_along: float = parameter(
-        0.08,
+        0.04,
         "m",
-        "as max_sigma, along walls that hold all else: such matches are 12 mm off in the median, and 3 of 147 by "
-        "more than 0.1",
+        "as max_sigma, along walls that hold all else: with 0.08, 3 of 147 were more than 0.1 off, with this none",
         low=0.001,
         high=1.0,
     )
