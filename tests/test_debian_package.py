@@ -1,4 +1,4 @@
-"""What can be told of the Debian package without building it; `make board-test` installs it."""
+"""What can be told of the Debian package without building it; `make board-test` and `benchmarks/install_trial.sh` install it."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_what_is_carried_has_what_it_needs():
 
 
 def test_maintainer_scripts_are_shell_and_need_no_running_systemd():
-    for name in ("postinst", "prerm", "postrm"):
+    for name in ("preinst", "postinst", "prerm", "postrm"):
         script = PACKAGING / "debian" / name
         subprocess.run(["/bin/sh", "-n", str(script)], check=True)
         lines = script.read_text().splitlines()
@@ -86,7 +86,7 @@ def test_maintainer_scripts_are_shell_and_need_no_running_systemd():
 
 
 def test_build_scripts_are_shell():
-    for script in (*PACKAGING.glob("*.sh"), *(ROOT / "benchmarks" / "board").glob("*.sh")):
+    for script in (*PACKAGING.glob("*.sh"), *(ROOT / "benchmarks").rglob("*.sh")):
         subprocess.run(["bash", "-n", str(script)], check=True)
 
 
