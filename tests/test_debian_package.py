@@ -1,4 +1,4 @@
-"""What can be told of the Debian package without building it; `make board-test` and `benchmarks/install_trial.sh` install it."""
+"""What can be told of the Debian package without building it; `make board-test` and install_trial.sh install it."""
 
 from __future__ import annotations
 
