@@ -112,7 +112,13 @@ plugged_in() { # path in /sys, name in /dev, major, minor: what udev's rules mak
   inside unshare -m sh -c "mkdir -p /dev/${2%/*}; mknod -m 600 /dev/$2 c $3 $4; mount --bind /opt/sys /sys
     SYSTEMD_DEVICE_VERIFY_SYSFS=0 udevadm test --action=add /devices/$1" >"$work/udev.log" 2>&1 || fail "udevadm: $(cat "$work/udev.log")"
 }
-given() { [[ $(inside stat -Lc '%G %a' "$1") == 'robominer-devices 660' ]] || fail "udev: $1: $(grep "${1##*/}" "$work/udev.log")"; }
+given() { # link or node in /dev; Debian 13's udevadm only says what it would do
+  local rule='70-robominer-slam.rules:[0-9]* '
+  grep "${rule}GROUP $(inside getent group robominer-devices | cut -d: -f3)$" "$work/udev.log" >/dev/null &&
+    grep "${rule}MODE 0660" "$work/udev.log" >/dev/null || fail "udev: no rights for $1"
+  [[ $1 != /dev/robominer/* ]] || grep -F "LINK '${1#/dev/}'" "$work/udev.log" >/dev/null || fail "udev: no $1"
+  [[ $SUITE != bookworm || $(inside stat -Lc '%G %a' "$1") == 'robominer-devices 660' ]] || fail "udev: not done: $1"
+}
 
 if [[ ! -e $BOARD/$base/.complete ]]; then
   mkdir -p "$BOARD"
