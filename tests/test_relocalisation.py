@@ -139,6 +139,15 @@ def test_changed_ground_alone_is_no_reason_to_give_the_place_up():
         assert not doubts.carried_away
 
 
+def test_where_the_place_is_unsure_ground_that_does_not_fit_raises_no_doubt_unless_it_broke():
+    doubts, unsure = Doubts(RelocalisationSection()), np.diag([0.2**2, 0.01**2, 0.1**2])
+    assert doubts.are_sensible(0.01 * unsure)
+    assert not doubts.are_sensible(unsure)
+    judged(doubts, 0, 0, match(1.0))
+    judged(doubts, 1, 1, match(0.3))
+    assert doubts.are_sensible(unsure)
+
+
 def test_a_break_means_carried_away_once_the_map_contradicts_or_nothing_explains_it():
     doubts = Doubts(RelocalisationSection())
     judged(doubts, 0, 0, match(1.0))

@@ -8,10 +8,17 @@ the whole map for what is touched now.
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
 from robominer_slam.configuration.relocalisation_section import RelocalisationSection
 from robominer_slam.slam.keyframe import Keyframe
 from robominer_slam.slam.surface_registration import SurfaceMatch
 
+#: A place that may be as far off as a second opinion would be, by so many sigmas, is not contradicted by its ground.
+UNSURE_SIGMAS = 2.0
 #: Keyframes in a row that must fit ground with relief before a break is taken for explained.
 FITTING_AFTER_BREAK = 3
 
@@ -37,6 +44,15 @@ class Doubts:
         if self._breaks is not None and keyframe.breaks > self._breaks:
             self.broken, self._age, self._fitting = True, 0, 0
         self._breaks = keyframe.breaks
+
+    def are_sensible(self, covariance: NDArray[np.float64]) -> bool:
+        """Whether ground that does not fit would tell anything; without a break not where the place is unsure anyway.
+
+        Args:
+            covariance: of x, y (m) and heading in map, shape (3, 3).
+        """
+        sigma = math.sqrt(max(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]), 0.0))
+        return self.broken or UNSURE_SIGMAS * sigma <= self._parameters.elsewhere
 
     def judge(self, match: SurfaceMatch | None, closed: bool = False) -> None:
         """Take how that keyframe fits the map.

@@ -181,7 +181,8 @@ class LocalisedBackend:
         closed = result.closures > 0
         # After a break, what was touched before it is what the robot may have left.
         recent = {k.id for k in self._held} if self._doubts.broken else None
-        self._doubts.judge(None if closed else self._session.look(keyframe, self._model, recent), closed)
+        asked = not closed and self._doubts.are_sensible(result.covariance)
+        self._doubts.judge(self._session.look(keyframe, self._model, recent) if asked else None, closed)
         if self._doubts.any:
             return self._doubted(keyframe, result)
         self._second_opinion, self._ground = None, None
