@@ -87,8 +87,6 @@ class RobustBackend:
         self._version += 1
         return self._result(keyframe, len(accepted))
 
-    # ------------------------------------------------------------------------------------------------ nodes
-
     def _add_node(self, keyframe: Keyframe) -> None:
         level, tilt = geometry.levelled(keyframe.T_odom_base)
         k = keyframe.id
@@ -129,8 +127,6 @@ class RobustBackend:
             walls.append(placed(patch.walls, np.append(pose, dz)))
             oldest = k
         return Patch(np.concatenate(parts), keyframe.travelled, np.concatenate(walls)), oldest
-
-    # --------------------------------------------------------------------------------------------- closures
 
     def _is_searched(self, key: int) -> bool:
         """Whether closures are searched at all, and this keyframe's turn has come."""
@@ -224,8 +220,6 @@ class RobustBackend:
         self._recent += accepted
         return accepted
 
-    # -------------------------------------------------------------------------------------------- optimising
-
     def _optimise(self, accepted: list[Closure]) -> None:
         """Optimise as much of the graph as the new closures ask for."""
         bounds, graph = self._parameters.bounds, self._graph
@@ -254,8 +248,6 @@ class RobustBackend:
         moved, turned = float(np.hypot(off[0], off[1])), abs(float(off[2]))
         return moved > bounds.local_distance or turned > np.deg2rad(bounds.local_angle_deg)
 
-    # ------------------------------------------------------------------------------------------------ bounds
-
     def _bound(self, newest: int, load: int) -> None:
         """Let go of touches and keyframes that are too many."""
         p = self._parameters.closure
@@ -269,8 +261,6 @@ class RobustBackend:
     def release(self) -> None:
         """Let go of what must be freed in the thread that made it."""
         self._tracked.forget()
-
-    # ------------------------------------------------------------------------------------------------ result
 
     def _result(self, keyframe: Keyframe, closures: int) -> BackendResult:
         nodes = self._graph.nodes
