@@ -158,9 +158,10 @@ inside id $name >/dev/null && inside getent group robominer-devices >/dev/null |
 ok 'user and group are there'
 [[ $(inside systemctl is-enabled $name) == enabled ]] && is InactiveExitTimestampMonotonic 0 || fail 'not enabled, or started'
 ok 'enabled and not started, since doctor is not content'
-made_up_sys /proc/"$init"/root/opt/sys
+system=/proc/$init/root
+made_up_sys "$system/opt/sys"
 echo 'ENV{ROBOMINER}=="1", ENV{ID_SERIAL_SHORT}=="85735313932351E0C1A1", SYMLINK+="robominer/whiskers"' \
-  >/proc/"$init"/root/etc/udev/rules.d/71-robominer-names.rules
+  >"$system/etc/udev/rules.d/71-robominer-names.rules"
 plugged_in $usb/1-1:1.0/tty/ttyACM0 ./ttyACM0 166 0
 for port in by-serial/Arduino_Uno_85735313932351E0C1A1-if00 by-socket/pci-0000:00:1d.0-usb-0:1:1.0 whiskers; do
   given /dev/robominer/$port
@@ -172,7 +173,7 @@ ok "udev's rules give a made-up Arduino its group and its names, by serial numbe
 "${program[@]}" simulate --scenario 0 --engine quasi-static --out "$work/robot" --json >"$work/simulator.log" 2>&1 &
 simulator=$!
 until [[ -s $work/simulator.log ]]; do kill -0 $simulator; sleep 0.2; done
-etc=/proc/$init/root/etc/$name
+etc=$system/etc/$name
 cp "$work/robot/calibration.json" "$etc/"
 sed "s#^path = .*#path = \"/var/lib/$name/map.db\"#" "$work/robot/config.toml" >"$etc/config.toml"
 for link in "$work"/robot/dev/*; do

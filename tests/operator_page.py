@@ -86,12 +86,21 @@ def browser(*flags: str) -> Iterator[Browser]:
         chromium.close()
 
 
+#: Of the pages that were opened.
+_COMPLAINTS: dict[Page, list[str]] = {}
+
+
+def complaints_of(page: Page) -> list[str]:
+    """What the page's scripts have complained of since it was `opened`."""
+    return _COMPLAINTS[page]
+
+
 def opened(chromium: Browser, address: str, width: int = 900, height: int = 640) -> Page:
     """The page with the robot on it; what the page's scripts complain of fails the test that ends it."""
     page = chromium.new_page(viewport={"width": width, "height": height})
     page.set_default_timeout(PATIENCE_MS)
-    page.complaints = []  # type: ignore[attr-defined]
-    page.on("pageerror", lambda error: page.complaints.append(str(error)))  # type: ignore[attr-defined]
+    complaints = _COMPLAINTS[page] = []
+    page.on("pageerror", lambda error: complaints.append(str(error)))
     page.goto(address)
     page.wait_for_selector("[data-testid=map] canvas")
     return page

@@ -49,11 +49,16 @@ def test_two_devices_on_one_pattern_are_not_mixed_up(tmp_path):
 
 def test_nothing_is_written_to_a_port_that_is_only_listened_to(tmp_path):
     """It may be a motor's."""
-    motor = FakeDevice(tmp_path / "tty0", [(0x33, b"not for us")])
     pings = []
-    motor.send = lambda kind, sequence, payload: (  # type: ignore[method-assign]
-        pings.append(kind) if kind == 0x71 else FakeDevice.send(motor, kind, sequence, payload)
-    )
+
+    class Motor(FakeDevice):
+        def send(self, kind: int, sequence: int, payload: bytes) -> None:
+            if kind == 0x71:
+                pings.append(kind)
+            else:
+                super().send(kind, sequence, payload)
+
+    motor = Motor(tmp_path / "tty0", [(0x33, b"not for us")])
     try:
         with SerialReader([settings(tmp_path, "whiskers")]) as reader:
             deadline = time.monotonic() + 3.0

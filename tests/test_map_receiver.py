@@ -26,13 +26,14 @@ class Wire:
         self.world = World(seed, points)
         self.publisher = MapPublisher(self, MAP_ID, cell)
         self.receiver = MapReceiver(self, clock=lambda: self.now)
+        self.deliver: Callable[[Received], None] = self.receiver.take
         self.lost: Callable[[], bool] = lambda: False
         self.asked: list[Mapping[str, str]] = []
         self._pending: list[tuple[Mapping[str, str], Callable[[Received], None], Callable[[], None]]] = []
 
     def put(self, key: str, payload: bytes) -> None:
         if not self.lost():
-            self.receiver.take(Received(key, payload, "", None))
+            self.deliver(Received(key, payload, "", None))
 
     def subscriber(self, key: str, callback: Callable[[Received], None]) -> None:
         raise AssertionError(f"{key}: {callback} is not needed, messages are handed over here")
@@ -112,8 +113,8 @@ def test_telemetry_that_overtakes_an_update_is_no_reason_to_ask() -> None:
     wire = Wire(2)
     wire.step()
     wire.tick()
-    late: list[tuple[str, bytes]] = []
-    wire.receiver.take, take = lambda received: late.append(received), wire.receiver.take  # type: ignore[method-assign]
+    late: list[Received] = []
+    wire.deliver, take = late.append, wire.deliver
     wire.step()
     wire.tick()
     assert not wire.receiver.synchronised

@@ -19,7 +19,7 @@ from robominer_slam.publishing.bus_messages import QueryError
 from robominer_slam.publishing.robot_settings import robot_settings
 from robominer_slam.publishing.zenoh_session import ZenohBus, ZenohSettings
 from robominer_slam.security.authority import Authority
-from tests.operator_page import PATIENCE_MS, browser, console, free_port, opened, program, status_of
+from tests.operator_page import PATIENCE_MS, browser, complaints_of, console, free_port, opened, program, status_of
 from tests.published_robot import PublishedRobot
 
 RECORDING = Path(__file__).parent / "recordings"
@@ -68,7 +68,7 @@ def test_by_tls_a_viewer_sees_all_and_may_not_command(chromium: Browser, tmp_pat
         page.goto(operators)
         expect(page.locator("body")).to_have_attribute("data-link", "live", timeout=PATIENCE_MS)
         expect(pressed(page, "cmd-rezero")).to_have_attribute("data-outcome", "done", timeout=PATIENCE_MS)
-        assert page.complaints == []  # type: ignore[attr-defined]
+        assert complaints_of(page) == []
         page.close()
 
 

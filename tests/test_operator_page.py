@@ -12,7 +12,7 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from robominer_slam.store_reader import load_map
-from tests.operator_page import PATIENCE_MS, browser, console, free_port, opened, stats, status_of
+from tests.operator_page import PATIENCE_MS, browser, complaints_of, console, free_port, opened, stats, status_of
 from tests.published_robot import PublishedRobot
 from tests.test_map_files import stored
 
@@ -46,7 +46,7 @@ def page(chromium: Browser, robot: PublishedRobot, tmp_path_factory: pytest.Temp
     with console(log, "--connect", robot.endpoint) as address:
         page = opened(chromium, address)
         yield page
-        assert page.complaints == []  # type: ignore[attr-defined]
+        assert complaints_of(page) == []
         page.close()
 
 

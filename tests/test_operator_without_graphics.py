@@ -6,7 +6,7 @@ from pathlib import Path
 
 from playwright.sync_api import expect
 
-from tests.operator_page import NO_GRAPHICS, browser, console, free_port, opened
+from tests.operator_page import NO_GRAPHICS, browser, complaints_of, console, free_port, opened
 from tests.published_robot import PublishedRobot
 
 
@@ -20,4 +20,4 @@ def test_without_graphics_the_page_says_so_and_the_panels_work(tmp_path: Path):
         expect(page.get_by_test_id("no-graphics")).to_contain_text("no WebGL 2")
         expect(page.get_by_test_id("state")).to_have_text("localised")
         expect(page.locator("[data-whisker='17']")).to_have_attribute("data-state", "touch")
-        assert page.complaints == []  # type: ignore[attr-defined]
+        assert complaints_of(page) == []
